@@ -19,8 +19,8 @@ spends in each part meanwhile; `waited_ms`, from other steps, has the device fin
 the next. Operations are those that a dispatch mode sees in a step, views apart; the profiler counts
 launches, on CUDA.
 
-`--graphs` is `train.graphs`; "both" measures first without and then with CUDA graphs, on one model,
-and has the first under `without_graphs`.
+`--graphs` is `train.graphs`; "both" measures first without CUDA graphs, then with those of the scene
+alone, then with those of whole steps, on one model; `loss` is then all of a step's replay.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ from benchmarks.at_size import (
 from hoigs.core.values.clip import Clip
 from hoigs.training.graphs import GraphedScene
 from hoigs.training.session import Session
+from hoigs.training.step_graph import StepGradients
 from hoigs.training.trainer import Trainer
 
 LONG_RUN = 30_000
@@ -61,7 +62,7 @@ LONG_RUN = 30_000
 WRAPPED = (
     ("objective._deform", "deform"),
     ("model.draw", "raster"),
-    ("objective", "loss"),
+    ("gradients", "loss"),
     ("optimizer.step", "optimiser"),
     ("optimizer.zero_grad", "optimiser"),
     ("_evolve", "density"),
@@ -209,12 +210,7 @@ def measure(trainer: Trainer, steps: int) -> dict[str, Any]:
 def measured(trainer: Trainer, steps: int) -> dict[str, Any]:
     """All figures of the trainer as it is, and whether graphs were replayed."""
     found = measure(trainer, steps) | operations(trainer, min(4, steps))
-    graphed = trainer.objective.graphed_scene
-    found["graphs"] = {
-        "mode": graphed.mode,
-        "reason": graphed.reason,
-        "captures": graphed.captures,
-    }
+    found["graphs"] = trainer.gradients.used()
     return found
 
 
@@ -230,7 +226,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="keep the run, for frame_rate.py --run")
     options = parser.parse_args()
     size, splats = Size.parse(options.size), tuple(options.splats)
-    rounds = 2 if options.graphs == "both" else 1
+    rounds = 3 if options.graphs == "both" else 1
     total = rounds * (2 * options.steps + options.warmup + 100)
     settings = [
         f"train.steps={total}",
@@ -256,11 +252,16 @@ def main() -> None:
             assert frame.image.shape[1] == size.width
         objective, without = trainer.objective, {}
         if options.graphs == "both":
-            graphed = objective.graphed_scene
+            kept = objective.graphed_scene, trainer.gradients
             objective.graphed_scene = GraphedScene(trainer.model, "off", objective.weight_of)
+            trainer.gradients = StepGradients(objective, "off")
             run(trainer, options.warmup)
             without = {"without_graphs": measured(trainer, options.steps)}
-            objective.graphed_scene = graphed
+            # the model's part alone, as where a step has terms that no graph holds
+            objective.graphed_scene = kept[0]
+            run(trainer, options.warmup)
+            without["graphs_of_the_scene"] = measured(trainer, options.steps)
+            trainer.gradients = kept[1]
         run(trainer, options.warmup)
         report = {
             "machine": machine(trainer.model.device),
@@ -276,9 +277,9 @@ def main() -> None:
             trainer.checkpoint().save(session.run.checkpoints)
     print(f"{options.size}; {sum(report['splats'].values())} splats: {report['splats']}")
     print(f"{report['step_ms']:.2f} ms a step: 30,000 take {report['minutes_of_30k_steps']} min")
-    if without:
-        print(f"{report['without_graphs']['step_ms']:.2f} ms a step without graphs")
-    print(f"graphs: {report['graphs']['mode']}, {report['graphs']['reason']}")
+    for name in without:
+        print(f"{report[name]['step_ms']:.2f} ms a step {name.replace('_', ' ')}")
+    print(f"graphs: {report['graphs']['mode']}, {report['graphs']['why']}")
     print(f"{report['operations']:.0f} operations a step, {report['views']:.0f} views beside them")
     for name in report["host_ms"]:
         host, waited = report["host_ms"][name], report["waited_ms"][name]

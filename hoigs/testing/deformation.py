@@ -509,7 +509,7 @@ def statistics_of(subject: DeformationSubject, entity: Entity, frame: int) -> St
     return StepStatistics(
         moment=subject.at(entity, time),
         camera=camera_at(time).to(entity.means),
-        error=1.0 + 0.5 * time,
+        error=torch.tensor(1.0 + 0.5 * time),
         screen_gradient=torch.linspace(0, 1, 2 * len(entity)).reshape(-1, 2).to(entity.means),
         radii=torch.full_like(entity.opacity_logits.detach(), 5.0),
         step=1,

@@ -213,7 +213,7 @@ class GraphKey:
         ]
         people = tuple((name, p.convention) for name, p in self.layout.people.items())
         kinds = tuple((name, x is None, trained) for _, name, x, _, trained in self._tensors)
-        self.structure = (self._interaction_enabled, people, kinds)
+        self.structure: tuple[object, ...] = (self._interaction_enabled, people, kinds)
 
     def holds(self, model: SceneModel, moment: Moment) -> bool:
         """Whether nothing has changed since this key was made."""
@@ -374,7 +374,7 @@ class GraphedScene:
                 failure = self._difference(step, moment)
         except (RuntimeError, TypeError, ValueError, NotImplementedError, PluginError) as error:
             # what CUDA or a component raises when it is captured; reported below
-            failure = _root_cause(error)
+            failure = root_cause(error)
         if failure is None:
             self._graphed_step = step
             self._compared.add(graph_key.structure)
@@ -403,7 +403,7 @@ class GraphedScene:
             return "the graph does not have the outputs of eager execution"
         names = {" of ".join(key[::-1]): key for key in eager}
         pairs = {f"{n} of the graph": (graphed[k], eager[k].detach()) for n, k in names.items()}
-        difference = _first_difference(pairs)
+        difference = first_difference(pairs)
         if difference is not None:
             return difference
         generator = torch.Generator(self._model.device).manual_seed(0)  # not the run's own numbers
@@ -423,7 +423,7 @@ class GraphedScene:
                 return f"{name} has a gradient either by the graph or by eager execution, not both"
             if ours is not None and theirs is not None:
                 pairs[f"the gradient of {name} by the graph"] = (ours, theirs)
-        return _first_difference(pairs)
+        return first_difference(pairs)
 
 
 def components_of(model: SceneModel) -> dict[str, object]:
@@ -474,7 +474,7 @@ class _ModelStep(nn.Module):
         return found
 
 
-def _first_difference(pairs: Mapping[str, tuple[Tensor, Tensor]]) -> str | None:
+def first_difference(pairs: Mapping[str, tuple[Tensor, Tensor]]) -> str | None:
     """The first pair that differs by more than `TOLERANCE`, as a message; one device-to-host copy.
 
     Relative to each tensor's norm plus a millionth of the largest norm, which excuses tensors that
@@ -491,7 +491,7 @@ def _first_difference(pairs: Mapping[str, tuple[Tensor, Tensor]]) -> str | None:
     return None
 
 
-def _root_cause(error: BaseException) -> str:
+def root_cause(error: BaseException) -> str:
     """The first line of the first error; a failed capture raises more errors on its way out."""
     while error.__context__ is not None:
         error = error.__context__

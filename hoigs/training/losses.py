@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Int32, Shaped, UInt8
 from torch import Tensor
 
 from hoigs.core.spec.train_schema import LossSpec
@@ -17,6 +17,7 @@ from hoigs.core.values.clip import Frame
 from hoigs.metrics.ssim import Backend, ssim
 
 PIXELS_FIT = 16_384  # about as many pixels enter medians and fits of depth
+FEWEST = 16  # pixels with a prior, below which L_depth says nothing
 DepthFit = Literal["auto", "scale", "affine"]
 
 # "supp": supplement, "Objective Function Details"; "main": Eq. 15, a sum without weights
@@ -80,7 +81,7 @@ def _affine_disparity(
     return 1.0 / fit.clamp_min(1e-3)
 
 
-def _some(values: Float[Tensor, " P"]) -> Float[Tensor, " Q"]:
+def _some(values: Shaped[Tensor, " P"]) -> Shaped[Tensor, " Q"]:
     """An evenly spaced subset: the median of a million pixels takes tens of milliseconds."""
     return values[:: 1 + len(values) // PIXELS_FIT]
 
@@ -94,8 +95,9 @@ def depth_loss(
 ) -> Float[Tensor, ""] | None:
     """Mean |D_render - D| over the median depth of the prior (HOIGS, Sec. "Human Deformation").
 
-    Over pixels with a prior and an opacity above 0.5; D_render is divided by alpha. None with fewer
-    than 16 such pixels, or when the clip has no depth.
+    Over pixels with a prior and an opacity above 0.5; D_render is divided by alpha. With fewer than
+    16 such pixels it is 0 for a metric prior that needs no fit, for which nothing waits for the
+    device, and None for others, as it is when the clip has no depth.
 
     Args:
         depth: accumulated depth, metres. prior: 0 where unknown. kind, fit: as for `align_depth`.
@@ -103,13 +105,31 @@ def depth_loss(
     if kind == "none":
         return None
     valid = (prior > 0) & torch.isfinite(prior) & (alpha.detach() > 0.5)
+    if kind == "metric" and fit == "auto":
+        return _metric_depth_loss(depth, alpha, prior, valid)
     chosen = valid.flatten().nonzero().squeeze(1)
-    if len(chosen) < 16:
+    if len(chosen) < FEWEST:
         return None
     expected, seen, prior = (x.flatten().index_select(0, chosen) for x in (depth, alpha, prior))
     expected = expected / seen.clamp_min(1e-6)
     target = align_depth(expected, prior, kind, fit)
     return (expected - target).abs().mean() / _some(target).median()
+
+
+def _metric_depth_loss(
+    depth: Float[Tensor, "H W"],
+    alpha: Float[Tensor, "H W"],
+    prior: Float[Tensor, "H W"],
+    valid: Bool[Tensor, "H W"],
+) -> Float[Tensor, ""]:
+    """`depth_loss` by operations whose sizes do not depend on what is valid."""
+    count = valid.sum()
+    expected = torch.where(valid, depth, 0.0) / torch.where(valid, alpha, 1.0)
+    apart = (expected - torch.where(valid, prior, 0.0)).abs().sum() / count.clamp_min(1)
+    some, known = _some(prior.flatten()), _some(valid.flatten())
+    ordered = torch.where(known, some, torch.inf).sort().values
+    middle = ordered.index_select(0, (known.sum()[None] - 1).clamp_min(0) // 2).squeeze(0)
+    return torch.where(count < FEWEST, 0.0 * apart, apart / middle)
 
 
 # Comparison: what a box of a render is compared with, and the image loss between the two.
@@ -130,6 +150,7 @@ class Comparison:
         top, left: of the box in the render, pixels.
         area: L1 is the sum of absolute differences over three times this many pixels; None for
             those of the box, which makes it a mean.
+        box: as of `Crop`; `pixels` and masks are whole images then.
     """
 
     pixels: UInt8[Tensor, "h w 3"]
@@ -139,6 +160,7 @@ class Comparison:
     top: int = 0
     left: int = 0
     area: int | None = None
+    box: Int32[Tensor, "5"] | None = None
 
     @property
     def target(self) -> Float[Tensor, "h w 3"]:
@@ -176,11 +198,32 @@ def image_losses(
 def _by_torch(
     render: Float[Tensor, "H W 3"], one: Comparison, lambda_dssim: float, backend: Backend
 ) -> Float[Tensor, ""]:
+    if one.box is not None:
+        one = _within_box(one)
+        if one.pixels.numel() == 0:
+            return 0.0 * render.sum()
     target, own = one.target, one.render_of(render)
     l1 = (own - target).abs().sum() / (3.0 * _area(one))
     if lambda_dssim == 0:
         return l1
     return (1 - lambda_dssim) * l1 + lambda_dssim * (1 - ssim(own, target, backend))
+
+
+def _within_box(one: Comparison) -> Comparison:
+    """The same comparison of slices, which waits for the device of the box."""
+    assert one.box is not None
+    top, left, height, width, area = one.box.tolist()
+    cut = (slice(top, top + height), slice(left, left + width))
+    return replace(
+        one,
+        pixels=one.pixels[cut],
+        shown=None if one.shown is None else one.shown[cut],
+        ignored=None if one.ignored is None else one.ignored[cut],
+        top=top,
+        left=left,
+        area=None if one.area is None else area,
+        box=None,
+    )
 
 
 def _by_kernels(
@@ -192,13 +235,15 @@ def _by_kernels(
     targets = [
         Target(
             one.pixels,
-            l1=(1 - lambda_dssim) / (3.0 * _area(one)),
+            l1=(1 - lambda_dssim) / (1.0 if one.box is not None else 3.0 * _area(one)),
             dssim=lambda_dssim,
             shown=one.shown,
             ignored=one.ignored,
             background=one.background,
             top=one.top,
             left=one.left,
+            box=one.box,
+            by_area=one.area is not None,
         )
         for one in comparisons
     ]
@@ -221,6 +266,9 @@ class Crop:
         mask: the entity's visible pixels. area: how many these are.
         ignore: pixels where another entity may hide it, or that show no scene.
         top, left: of the box in the frame, pixels.
+        box: top, left, height, width and area, on the device, where a CUDA graph reads them anew at
+            each step; everything else is of the whole frame then, and `area` no number. None: the
+            crop is what the tensors hold.
     """
 
     camera: Camera
@@ -230,6 +278,7 @@ class Crop:
     area: int
     top: int = 0
     left: int = 0
+    box: Int32[Tensor, "5"] | None = None
 
     @property
     def image(self) -> Float[Tensor, "h w 3"]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from hoigs.core.errors import NotFiniteError
@@ -82,9 +84,42 @@ class NanGuard:
         self.patience = patience
         self.in_a_row = 0
         self.skipped: list[tuple[int, str]] = []
+        self._watched: deque[tuple[int, Tensor, torch.cuda.Event | None]] = deque()
 
     def passed(self) -> None:
         self.in_a_row = 0
+
+    def watch(self, step: int, finite: Bool[Tensor, ""]) -> None:
+        """Take note of a step of which only the device knows whether its gradients were finite."""
+        if not finite.is_cuda:
+            self._watched.append((step, finite, None))
+            return
+        known = torch.empty_like(finite, device="cpu", pin_memory=True)
+        known.copy_(finite, non_blocking=True)
+        event = torch.cuda.Event()
+        event.record(torch.cuda.current_stream(finite.device))
+        self._watched.append((step, known, event))
+
+    def read(self, culprit: Callable[[], str | None], wait: bool) -> bool:
+        """Count the watched steps of which the answer is here; whether the last of these passed.
+
+        Args:
+            culprit: names what was not finite. wait: for the device, and so for all steps.
+        """
+        passed = True
+        while self._watched:
+            step, finite, event = self._watched[0]
+            if event is not None and wait:
+                event.synchronize()
+            elif event is not None and not event.query():
+                break
+            self._watched.popleft()
+            passed = bool(finite)
+            if passed:
+                self.passed()
+            else:
+                self.failed(step, culprit() or "a gradient")
+        return passed
 
     def require_any(self, steps: int) -> None:
         """Raise NotFiniteError if every one of so many steps was skipped."""

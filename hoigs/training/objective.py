@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from hoigs.core.device import constant
@@ -42,6 +42,7 @@ class ObjectiveResult:
         screen_offsets: its gradient is the screen-space one of `state.joined()`, per pixel.
         absolute_gradients: its gradient is the sum of absolute values over pixels; None if no
             density control needs that.
+        finite: whether all gradients are, on the device; None where nobody has looked yet.
     """
 
     terms: dict[str, Tensor]
@@ -51,6 +52,7 @@ class ObjectiveResult:
     screen_offsets: Float[Tensor, "N 2"]
     weights: dict[str, float] = field(default_factory=dict)
     absolute_gradients: Float[Tensor, "N 2"] | None = None
+    finite: Bool[Tensor, ""] | None = None
 
 
 @dataclass(frozen=True)
@@ -118,11 +120,38 @@ class JointObjective:
             camera: the frame's, refined where cameras are, on the model's device.
             generator: of random backgrounds, CPU.
         """
-        device = camera.K.device
         if isinstance(view, Frame):
-            view = TrainingView.of(view, device)
-        frame = view.frame
-        deformed = self._deform(frame.moment)
+            view = TrainingView.of(view, camera.K.device)
+        backgrounds = self.backgrounds(view, generator)
+        return self.losses(view, camera, self._deform(view.frame.moment), backgrounds, generator)
+
+    def backgrounds(
+        self, view: TrainingView, generator: torch.Generator
+    ) -> dict[str, Float[Tensor, "3"]]:
+        """The colour behind each person and object that is drawn alone, on the CPU."""
+        kinds = ("object",) if self.spec.human_image == "composite" else ("human", "object")
+        drawn = [n for k in kinds for n in self.model.names(k) if n in view.crops]
+        if self.settled:
+            return {}
+        if self.spec.background == "black":
+            return {name: torch.zeros(3) for name in drawn}
+        return {name: torch.rand(3, generator=generator) for name in drawn}
+
+    def losses(
+        self,
+        view: TrainingView,
+        camera: Camera,
+        deformed: Deformed,
+        backgrounds: Mapping[str, Float[Tensor, "3"]],
+        generator: torch.Generator,
+    ) -> ObjectiveResult:
+        """The loss of a view, given the scene at its moment.
+
+        Args:
+            view, camera: on the model's device. backgrounds: from the method of that name, on any
+                device. generator: of what plugins draw.
+        """
+        frame, device = view.frame, camera.K.device
         state = self._settled(deformed.state) if self.settled else deformed.state
         offsets = torch.zeros(
             sum(len(g) for g in state.gaussians.values()), 2, device=device, requires_grad=True
@@ -159,7 +188,7 @@ class JointObjective:
                 if crop is None:  # not visible in this frame: it has no terms
                     continue
                 if kind == "object" or self.spec.human_image != "composite":
-                    terms |= self._alone(name, kind, crop, camera, state, generator)
+                    terms |= self._alone(name, kind, crop, camera, state, backgrounds[name])
                 if kind == "human":
                     terms |= self._human(name, frame, crop, camera, state, composite)
         weights = {name: self.weights[name.partition("/")[0]] for name in terms}
@@ -218,7 +247,7 @@ class JointObjective:
                 if crop is not None:
                     hidden = None if frame.ignored is None else crop.cut(frame.ignored)
                     found[f"human/{name}/composite"] = Comparison(
-                        crop.pixels, ignored=hidden, top=crop.top, left=crop.left
+                        crop.pixels, ignored=hidden, top=crop.top, left=crop.left, box=crop.box
                     )
         if not found:
             return {}
@@ -282,21 +311,19 @@ class JointObjective:
         crop: Crop,
         camera: Camera,
         state: SceneState,
-        generator: torch.Generator,
+        background: Float[Tensor, "3"],
     ) -> dict[str, Tensor]:
         """The entity rendered alone over one colour: L_object (Eq. 17), or L_img of Eq. 16.
 
         L1 is divided by the area of the mask.
         """
-        background = torch.zeros(3)
-        if self.spec.background == "random":
-            background = torch.rand(3, generator=generator)
-        background = background.to(camera.K)
+        # without waiting for what the device is doing: CUDA has read the colour at the return
+        background = background.to(camera.K, non_blocking=True)
         output = self.model.draw(
             state.gaussians[name], crop.seen_from(camera), RenderRequest(background=background)
         )
         compared = Comparison(
-            crop.pixels, crop.mask, crop.ignore, background, area=crop.area
+            crop.pixels, crop.mask, crop.ignore, background, area=crop.area, box=crop.box
         )  # fmt: skip
         terms = {f"{kind}/{name}": self._image_losses(output.color, [compared])[0]}
         if kind == "human" and self.lpips is not None and self.spec.lpips > 0:

@@ -8,7 +8,8 @@ from itertools import chain
 from typing import get_args
 
 import torch
-from torch import nn
+from jaxtyping import Bool
+from torch import Tensor, nn
 
 from hoigs.core.errors import SpecError, did_you_mean
 from hoigs.core.model.entity import Entity
@@ -196,11 +197,12 @@ class GroupedAdam:
                 keyed.append(schedule.at(self.progress))
         return max(keyed)
 
-    def step(self, sh_degree: int | None = None) -> None:
+    def step(self, sh_degree: int | None = None, finite: Bool[Tensor, ""] | None = None) -> None:
         """One update of all parameters.
 
         Args:
             sh_degree: spherical harmonics above it get no gradient; None trains all.
+            finite: on the device; where it is False nothing changes, and nobody waits to know.
         """
         colors = [p for p, r in zip(self.names.values(), self.roles, strict=True) if r == "sh"]
         if sh_degree is not None:
@@ -209,6 +211,8 @@ class GroupedAdam:
                     parameter.grad[:, (sh_degree + 1) ** 2 :] = 0
         slowed = [p for p in colors if p.shape[1] > 1] if self.sh_rest != 1 else []
         before = [parameter.detach()[:, 1:].clone() for parameter in slowed]
+        # what torch's own gradient scaler tells a fused optimizer
+        setattr(self.adam, "found_inf", None if finite is None else (~finite).float())  # noqa: B010
         self.adam.step()
         for parameter, old in zip(slowed, before, strict=True):  # Adam's step is linear in its rate
             parameter.data[:, 1:].lerp_(old, 1 - self.sh_rest)

@@ -95,17 +95,18 @@ def train(
             report(f"view: http://{LOCAL}:{live.port}, after the first step and until the end")
         if trainer.windows is not None:
             report(trainer.windows.sentence())
+        graphs = trainer.gradients.sentence()
+        if graphs is not None:
+            report(graphs)
         if on_start is not None:
             on_start(session)
         session.train(on_step if on_step or not in_notebook() else _bar(session.spec.train.steps))
         for step, culprit in trainer.guard.skipped[:5]:
             report(f"skipped step {step}: {culprit} was not finite")
-        graphed = trainer.objective.graphed_scene
-        graphs = {"mode": graphed.mode, "captures": graphed.captures, "why": graphed.reason}
-        session.run.update(session.run.spec.read_text("utf-8"), {"cuda_graphs": graphs})
-        without = graphed.why_slower()
-        if without is not None:
-            report(f"trained without CUDA graphs, slower than it could be: {without}")
+        used = {"cuda_graphs": trainer.gradients.used()}
+        session.run.update(session.run.spec.read_text("utf-8"), used)
+        if trainer.gradients.sentence() != graphs:
+            report(f"since some step: {trainer.gradients.sentence()}")
         report(f"run: {path}")
         evaluated = _scored(path, options, progress, report) if options.evaluate else None
     if plan is not None:

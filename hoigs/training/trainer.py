@@ -45,6 +45,7 @@ from hoigs.training.nan_guard import (
 )
 from hoigs.training.objective import Extras, JointObjective, ObjectiveResult
 from hoigs.training.optimizer import GroupedAdam, entity_extent
+from hoigs.training.step_graph import StepGradients
 from hoigs.training.time_windows import TimeWindows
 from hoigs.training.unseen import Filling
 from hoigs.training.views import TrainingViews
@@ -202,6 +203,7 @@ class Trainer:
         extras = Extras(lpips, density, faces, self.cameras, scale, objectives)
         graphs = spec.graphs if spec.chunk is None else "off"
         self.objective = JointObjective(model, spec.loss, clip.depth_kind, extras, graphs)
+        self.gradients = StepGradients(self.objective, graphs)
         scene_extent, frames = clip.extent(), clip.split["train"]
         self.settled = spec.steps
         if spec.passes is not None:
@@ -309,20 +311,17 @@ class Trainer:
         self.model.set_progress(progress)
         view = self.views[self.sampler.next()]
         camera = self._camera(view.frame)
-        result = self.objective(view, camera, self.generator)
-        if self.step in (1, self.spec.steps) or self.step % self.spec.log_every == 0:
-            require_finite_outputs(self.model, result.state)
         self.optimizer.zero_grad()
-        result.total.backward()
-        if not gradients_finite(self.optimizer.names):
-            culprit = first_not_finite(result.terms, result.state.gaussians, self.optimizer.names)
-            self.guard.failed(self.step, culprit or "a gradient")
+        result = self.gradients(view, camera, self.generator)
+        logged = self.step in (1, self.spec.steps) or self.step % self.spec.log_every == 0
+        if logged:
+            require_finite_outputs(self.model, result.state)
+        if not self._finite(result, wait=logged):
             self.optimizer.zero_grad()
             return None
-        self.guard.passed()
         self.unseen.spare(self.model)
         interval = self.spec.sh_interval
-        self.optimizer.step(None if interval is None else self.step // interval)
+        self.optimizer.step(None if interval is None else self.step // interval, result.finite)
         if self.windows is not None:
             self.windows.stepped()
         fixed = replace(camera, world_to_camera=camera.world_to_camera.detach())
@@ -331,6 +330,23 @@ class Trainer:
         self.unseen.after(self.step, self.model, self.clip)
         terms = {**result.terms, "total": result.total}
         return {name: term.detach() for name, term in terms.items()}
+
+    def _finite(self, result: ObjectiveResult, wait: bool) -> bool:
+        """Whether the step may be taken. Where the device skips it by itself, the guard is told of
+        that later, or at once if it is to wait."""
+
+        def culprit() -> str | None:
+            return first_not_finite(result.terms, result.state.gaussians, self.optimizer.names)
+
+        if result.finite is not None:
+            self.guard.watch(self.step, result.finite)
+            return self.guard.read(culprit, wait) or not wait
+        self.guard.read(culprit, wait=True)
+        if gradients_finite(self.optimizer.names):
+            self.guard.passed()
+            return True
+        self.guard.failed(self.step, culprit() or "a gradient")
+        return False
 
     def _camera(self, frame: Frame) -> Camera:
         """The frame's camera on the model's device, with its present corrections."""
@@ -348,9 +364,9 @@ class Trainer:
             if own is None:
                 own = result.terms.get("scene", result.terms.get("scene/masked"))
             statistics = StepStatistics(
-                moment.to(self.model.device),
+                moment.to(self.model.device, non_blocking=True),
                 camera,
-                float(own.detach()) if own is not None else 0.0,
+                own.detach() if own is not None else result.total.new_zeros(()),
                 gradient[row] if gradient is not None else None,
                 radii[row],
                 self.step,

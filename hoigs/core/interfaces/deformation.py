@@ -28,7 +28,8 @@ class StepStatistics:
 
     Attributes:
         moment, camera: those of the frame drawn, on the model's device.
-        error: image loss of the frame: the entity's own term, or the scene's if it has none.
+        error: image loss of the frame: the entity's own term, or the scene's if it has none, or 0.
+            On the model's device: a number of it would have to wait for the device.
         screen_gradient: d loss / d projected means, per pixel, or None.
         radii: on the screen, pixels; 0 where a Gaussian was not drawn.
         step, total_steps: the number of this step, from 1, and of all steps.
@@ -36,7 +37,7 @@ class StepStatistics:
 
     moment: Moment
     camera: Camera
-    error: float
+    error: Float[Tensor, ""]
     screen_gradient: Float[Tensor, "N 2"] | None
     radii: Float[Tensor, " N"]
     step: int

@@ -111,7 +111,11 @@ class RenderOutput:
 
 
 class Rasterizer(Configurable, ABC):
-    """A splatting backend. Results depend on the inputs alone; it never falls back to another."""
+    """A splatting backend. Results depend on the inputs alone; it never falls back to another.
+
+    One whose renders and gradients a CUDA graph may hold declares `cuda_graph_safe = True` in its
+    own class (`hoigs.core.fast.graphs`).
+    """
 
     capabilities: Capabilities
 
@@ -127,6 +131,12 @@ class Rasterizer(Configurable, ABC):
         Raises:
             RenderError: shapes, dtypes, devices or limits that this backend cannot draw.
         """
+
+    def graph_memory(self, device: torch.device) -> int:
+        """How much memory a render that is captured in a CUDA graph now would be given; a graph of
+        before is captured anew when this number changes. 0 where it does not change."""
+        del device
+        return 0
 
     def check_inputs(self, gaussians: Gaussians, camera: Camera, request: RenderRequest) -> None:
         """The checks that every backend shares; call first in `render`."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int32, UInt8
 from torch import Tensor
 
 from hoigs.core.fast.launch import CPU_FLAGS, prepared
@@ -15,19 +15,31 @@ from hoigs.core.first_order import first_order
 from hoigs.core.system.quiet_warp import wp
 from hoigs.metrics.kernels.tiles import SIDE, THREADS, backward, forward
 from hoigs.rasterizers.warp.cuda.launch import CudaStreams
-from hoigs.rasterizers.warp.records import F32, U8
+from hoigs.rasterizers.warp.records import F32, I32, U8
 
 # C++ of the image loss's kernels; the stages are those of SSIM (`warp.ssim.tile_source`).
 #
 # Lines of render, frame, masks and gradient are `stride` numbers apart, since all are boxes of
-# larger images; arrays begin at the box's first pixel. Where a pixel is ignored the render is
-# replaced by the target, so that it has neither a loss nor a gradient.
+# larger images; arrays begin at the box's first pixel, or, `boxed`, at that of the whole image, and
+# the box is read from the device. Where a pixel is ignored the render is replaced by the target, so
+# that it has neither a loss nor a gradient.
 
+_BOX = """
+    int top_ = 0, left_ = 0;
+    if (boxed) {
+        const int* found = (const int*)box.data;
+        top_ = found[0]; left_ = found[1]; height = found[2]; width = found[3];
+        if (height * width == 0) return;
+        l1_weight /= 3.0f * (boxed > 1 ? (float)found[4] : (float)height * (float)width);
+    }
+"""
+_INSIDE = "    if (tile / tiles_x >= tiles_y) return;  // the box is smaller than the image\n"
 _FETCH = """
-            const long long at = (long long)y * render_stride + x * channels + channel;
-            const long long masked = (long long)y * mask_stride + x;
-            b = ((const unsigned char*)pixels.data)[(long long)y * pixel_stride + x * channels
-                                                    + channel] / 255.0f;
+            const long long at = (long long)(y + top_) * render_stride + (x + left_) * channels
+                                 + channel;
+            const long long masked = (long long)(y + top_) * mask_stride + x + left_;
+            b = ((const unsigned char*)pixels.data)[(long long)(y + top_) * pixel_stride
+                                                    + (x + left_) * channels + channel] / 255.0f;
             if (with_shown && !((const unsigned char*)shown.data)[masked])
                 b = ((const float*)background.data)[channel];
             const bool hidden = with_ignored && ((const unsigned char*)ignored.data)[masked];
@@ -42,12 +54,12 @@ _GRADIENT = """
             const float sign = a > b ? 1.0f : (a < b ? -1.0f : 0.0f);
             float value = l1_weight * sign - dssim_weight / (float)numbers * slope;
             value = hidden ? 0.0f : scale * value;
-            float* into = (float*)gradient.data + (long long)y * gradient_stride + x * channels
-                          + channel;
+            float* into = (float*)gradient.data + (long long)(y + top_) * gradient_stride
+                          + (x + left_) * channels + channel;
             *into = add ? *into + value : value;
 """
-FORWARD = forward(_FETCH, _PIXEL)
-BACKWARD = backward(_FETCH, _GRADIENT)
+FORWARD = forward(_FETCH, _PIXEL, _BOX, _INSIDE)
+BACKWARD = backward(_FETCH, _GRADIENT, _BOX, _INSIDE)
 
 
 # The CUDA kernels of the image loss; their loops stand in `source`.
@@ -63,7 +75,7 @@ def forward_native(
     thread: int, batch: int, height: int, width: int, channels: int,
     render: F32, render_stride: int, pixels: U8, pixel_stride: int, shown: U8, ignored: U8,
     mask_stride: int, with_shown: int, with_ignored: int, background: F32, l1_weight: float,
-    dssim_weight: float, with_gradient: int, sums: F32, kept: F32,
+    dssim_weight: float, box: I32, boxed: int, with_gradient: int, sums: F32, kept: F32,
 ): ...  # fmt: skip
 
 
@@ -75,14 +87,17 @@ def forward_tiles(
     shown: U8,  # 0 where the target is the background; not read unless with_shown
     ignored: U8, mask_stride: int, with_shown: int, with_ignored: int,
     background: F32,  # [3]
-    l1_weight: float, dssim_weight: float, with_gradient: int,
+    l1_weight: float, dssim_weight: float,
+    box: I32,  # [5] top, left, height, width, area; not read unless boxed
+    boxed: int,  # 1 divides L1 by three times the pixels of the box, 2 by three times the area
+    with_gradient: int,
     sums: F32,  # [tiles] of the weighted loss
     kept: F32,  # [3, 3, height, width], or empty: to blur
 ):  # fmt: skip
     forward_native(
         wp.tid(), 1, height, width, 3, render, render_stride, pixels, pixel_stride, shown, ignored,
-        mask_stride, with_shown, with_ignored, background, l1_weight, dssim_weight, with_gradient,
-        sums, kept,
+        mask_stride, with_shown, with_ignored, background, l1_weight, dssim_weight, box, boxed,
+        with_gradient, sums, kept,
     )  # fmt: skip
 
 
@@ -91,7 +106,8 @@ def backward_native(
     thread: int, batch: int, height: int, width: int, channels: int,
     render: F32, render_stride: int, pixels: U8, pixel_stride: int, shown: U8, ignored: U8,
     mask_stride: int, with_shown: int, with_ignored: int, background: F32, l1_weight: float,
-    dssim_weight: float, kept: F32, upstream: F32, gradient: F32, gradient_stride: int, add: int,
+    dssim_weight: float, box: I32, boxed: int, kept: F32, upstream: F32, gradient: F32,
+    gradient_stride: int, add: int,
 ): ...  # fmt: skip
 
 
@@ -100,15 +116,15 @@ def backward_tiles(
     height: int, width: int,
     render: F32, render_stride: int, pixels: U8, pixel_stride: int, shown: U8, ignored: U8,
     mask_stride: int, with_shown: int, with_ignored: int, background: F32,
-    l1_weight: float, dssim_weight: float, kept: F32,
+    l1_weight: float, dssim_weight: float, box: I32, boxed: int, kept: F32,
     upstream: F32,  # [1]
     gradient: F32, gradient_stride: int,
     add: int,  # 0 writes the gradient, 1 adds to what stands there
 ):  # fmt: skip
     backward_native(
         wp.tid(), 1, height, width, 3, render, render_stride, pixels, pixel_stride, shown, ignored,
-        mask_stride, with_shown, with_ignored, background, l1_weight, dssim_weight, kept, upstream,
-        gradient, gradient_stride, add,
+        mask_stride, with_shown, with_ignored, background, l1_weight, dssim_weight, box, boxed,
+        kept, upstream, gradient, gradient_stride, add,
     )  # fmt: skip
 
 
@@ -123,8 +139,12 @@ class Target:
             background; None where all do. ignored: pixels without a loss, or None.
         background: RGB in [0, 1]; needed where `shown` is not None.
         top, left: of the box in the render, pixels.
-        l1: weight of the sum of absolute differences over the box.
+        l1: weight of the sum of absolute differences over the box; with `box`, of that sum over
+            three times the area there, or over the numbers of the box where `by_area` is False.
         dssim: weight of 1 - SSIM, which is a mean over the box.
+        box: top, left, height, width and area of a box of `pixels`, masks and render, which are
+            whole images then, on the device, from where a CUDA graph reads them anew. An empty box
+            has no loss.
     """
 
     pixels: UInt8[Tensor, "h w 3"]
@@ -135,6 +155,8 @@ class Target:
     background: Float[Tensor, "3"] | None = None
     top: int = 0
     left: int = 0
+    box: Int32[Tensor, "5"] | None = None
+    by_area: bool = True
 
 
 def image_losses(
@@ -169,7 +191,8 @@ class _ImageLosses(torch.autograd.Function):
     @first_order("image_losses", "train.loss.ssim: torch has the second, too")
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         render, *kept = ctx.saved_tensors
-        whole = ctx.targets[0].pixels.shape == render.shape
+        first = ctx.targets[0]
+        whole = first.pixels.shape == render.shape and first.box is None
         gradient = torch.empty_like(render) if whole else torch.zeros_like(render)
         given = upstream[0].contiguous()
         with torch.cuda.device_of(render):
@@ -202,7 +225,8 @@ def _launch(kernel: Any, target: Target, render: Tensor, rest: list[Any]) -> Non
         pixels, pixels.stride(0), shown, ignored, masks[0].stride(0) if masks else 0,
         int(target.shown is not None), int(target.ignored is not None),
         render if target.background is None else target.background,
-        target.l1, target.dssim, *rest,
+        target.l1, target.dssim, render if target.box is None else target.box,
+        0 if target.box is None else 1 + int(target.by_area), *rest,
     ]  # fmt: skip
     if render.is_cuda:
         _STREAMS.current().blocks(kernel, _tiles(pixels), THREADS, arguments)

@@ -176,27 +176,30 @@ _TAIL = r"""
 _SIZES = {"SIDE": SIDE, "THREADS": THREADS, "WEIGHTS": WEIGHTS}
 
 
-def forward(fetch: str, pixel: str) -> str:
+def forward(fetch: str, pixel: str, first: str = "", then: str = "") -> str:
     """Body of a forward kernel.
 
     Args:
         fetch: sets `a`, of the image, and `b`, of the target, at (x, y) of `channel`.
         pixel: adds to `sum` of the tile, from `value`, the pixel's SSIM.
+        first: may change the arguments before anything reads them. then: may return, for all
+            threads of a tile alike.
     """
     body = _FORWARD.replace("FETCH", fetch).replace("PIXEL", pixel)
-    return _HEAD % _SIZES + FORMULA + body + _TAIL
+    return first + _HEAD % _SIZES + then + FORMULA + body + _TAIL
 
 
-def backward(fetch: str, gradient: str) -> str:
+def backward(fetch: str, gradient: str, first: str = "", then: str = "") -> str:
     """Body of a backward kernel.
 
     Args:
         fetch: as in `forward`.
         gradient: writes a gradient at (x, y), from `slope`, the derivative of the sum of SSIM over
             all pixels by `a`, and `scale`, the upstream gradient. It sees the variables of `fetch`.
+        first, then: as in `forward`.
     """
     body = _BACKWARD.replace("FETCH", fetch).replace("GRADIENT", gradient)
-    return _HEAD % _SIZES + body + _TAIL
+    return first + _HEAD % _SIZES + then + body + _TAIL
 
 
 _FETCH = """

@@ -142,6 +142,7 @@ class McmcDensity(DensityControl):
     """
 
     Config: ClassVar = McmcDensityConfig
+    cuda_graph_safe = True
     cap: int
 
     def __init__(

@@ -56,6 +56,7 @@ class WarpRasterizer(Rasterizer):
     """
 
     Config: ClassVar = WarpConfig
+    cuda_graph_safe = True
     capabilities = Capabilities(
         devices=frozenset({"cpu", "cuda"}),
         dtypes=frozenset({"float32"}),
@@ -111,6 +112,10 @@ class WarpRasterizer(Rasterizer):
             camera,
             request or RenderRequest(),
         )
+
+    def graph_memory(self, device: torch.device) -> int:
+        pipeline = self._pipelines.get(device)
+        return 0 if pipeline is None or device.type != "cuda" else pipeline.capacity.now()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles carry the settings; they load their own kernels."""

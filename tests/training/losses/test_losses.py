@@ -37,9 +37,9 @@ def test_depth_loss_skips_what_is_unknown():
     prior[0] = 0.0  # unknown
     loss = depth_loss(depth, alpha, prior, "metric")
     assert loss is not None and float(loss) == pytest.approx(0.5)
-    assert depth_loss(depth, alpha, torch.zeros(8, 8), "metric") is None
+    assert depth_loss(depth, alpha, torch.zeros(8, 8), "metric") == 0
     assert depth_loss(depth, alpha, prior, "none") is None
-    assert depth_loss(depth, 0.4 * alpha, prior, "metric") is None
+    assert depth_loss(depth, 0.4 * alpha, prior, "metric") == 0
 
 
 def test_depth_that_is_no_depth_is_skipped():  # F44
@@ -53,7 +53,7 @@ def test_depth_that_is_no_depth_is_skipped():  # F44
     assert found is not None and torch.equal(found, expected)
     found.backward()
     assert torch.isfinite(leaf.grad).all() and (leaf.grad[:16] == 0).all()
-    assert depth_loss(depth, alpha, torch.full_like(good, torch.nan), "metric") is None
+    assert depth_loss(depth, alpha, torch.full_like(good, torch.nan), "metric") == 0
 
 
 def test_depth_sees_a_scale_about_the_camera_that_the_image_does_not():  # F17
@@ -115,10 +115,10 @@ def test_depth_needs_sixteen_pixels(known: int):
     depth, prior = torch.full((8, 8), 2.0), torch.zeros(8, 8)
     prior.view(-1)[:known] = 4.0
     found = depth_loss(depth, torch.ones(8, 8), prior, "metric")
-    assert (found is None) == (known < 16)
+    assert found is not None and (found == 0) == (known < 16)
     prior[-1] = torch.inf  # unknown, too
     again = depth_loss(depth, torch.ones(8, 8), prior, "metric")
-    assert again is None if found is None else float(again) == float(found)
+    assert again is not None and float(again) == float(found)
 
 
 @pytest.mark.parametrize(

@@ -69,6 +69,10 @@ class IntersectionCapacity:
         self._counted = (max(known[0], count), max(known[1], tiles))
         return max(self._grown(intersections), count)
 
+    def now(self) -> int:
+        """Intersections for which the next render of a known size would allocate."""
+        return self._grown(int(self._largest[0]))
+
     def exceeded(self, capacity: int) -> bool:
         """Whether some render had more intersections than this."""
         return int(self._largest[0]) > capacity

@@ -64,7 +64,8 @@ def follow(entity: Entity, path) -> None:
 
 
 def seen(time: float, error: float, step: int, total: int = 1000) -> StepStatistics:
-    return StepStatistics(Moment(time), CAMERA, error, None, torch.ones(12), step, total)
+    found = torch.tensor(error)
+    return StepStatistics(Moment(time), CAMERA, found, None, torch.ones(12), step, total)
 
 
 def test_uniform_knots_are_those_of_the_core():

@@ -34,7 +34,7 @@ def cloud(count: int = 50, dtype: torch.dtype = torch.float32) -> Gaussians:
 
 def statistics(count: int, step: int, radii: torch.Tensor | None = None) -> StepStatistics:
     radii = torch.ones(count) if radii is None else radii
-    return StepStatistics(Moment(0.5), CAMERA, 0.1, None, radii, step, 1000)
+    return StepStatistics(Moment(0.5), CAMERA, torch.tensor(0.1), None, radii, step, 1000)
 
 
 def moving(count: int = 50, promoted: int = 0, **settings: object) -> Entity:
