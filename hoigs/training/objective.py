@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from hoigs.core.device import constant
+from hoigs.core.fast.streams import apart
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.camera_refinement import CameraRefinement
@@ -29,6 +31,7 @@ from hoigs.training.losses import Comparison, Crop, depth_loss, image_losses, te
 from hoigs.training.views import TrainingView
 
 RESIDUAL_PENALTIES = ("residual_pose", "residual_means")  # on corrections by the interaction
+Part = tuple[RenderOutput | None, dict[str, Tensor], dict[str, float]]  # with terms and weights
 CAMERA_WEIGHT = 0.1  # of camera corrections; moving all cameras and the scene changes no image
 
 
@@ -163,49 +166,38 @@ class JointObjective:
         at = TrainingMoment(self.model, frame, camera, state, generator)
         channels = [objective.channels(at) for objective in further]
         drawn = [c for c in channels if c is not None]
-        composite = self.model.draw(
-            state.joined(),
-            camera,
-            RenderRequest(
-                features=torch.cat(drawn, 1) if drawn else None,
-                screen_offsets=offsets, absolute_gradients=absolutes,
-            ),
-        )  # fmt: skip
-        terms = self._composite(view, composite)
-        terms |= self._scene_alone(frame, camera, state, composite, offsets, absolutes)
-        if frame.depth is not None and self.weights["depth"] > 0:
-            prior = frame.depth * self.depth_scale
-            if frame.ignored is not None:
-                prior = prior.masked_fill(frame.ignored, 0.0)  # 0 = unknown
-            depth = depth_loss(
-                composite.depth, composite.alpha, prior, self.depth_kind, self.spec.depth_fit
-            )
-            if depth is not None:
-                terms["depth"] = depth
-        for kind in () if self.settled else ("human", "object"):
-            for name in self.model.names(kind):
-                crop = view.crops.get(name)
-                if crop is None:  # not visible in this frame: it has no terms
-                    continue
-                if kind == "object" or self.spec.human_image != "composite":
-                    terms |= self._alone(name, kind, crop, camera, state, backgrounds[name])
-                if kind == "human":
-                    terms |= self._human(name, frame, crop, camera, state, composite)
-        weights = {name: self.weights[name.partition("/")[0]] for name in terms}
+        request = RenderRequest(
+            features=torch.cat(drawn, 1) if drawn else None,
+            screen_offsets=offsets,
+            absolute_gradients=absolutes,
+        )
+        trained = [n for n in self.model.entities if not self.settled or self._is_scene(n)]
+        own: dict[str, Callable[[], Part]] = {
+            n: partial(self._of_entity, n, view, camera, deformed, backgrounds) for n in trained
+        }
+        own["composite"] = partial(self._of_composite, view, camera, state, request)
+        found = apart(own, (state, camera, view, backgrounds, request))
+        composite, terms, weights = found["composite"]
+        assert composite is not None
+        for name in trained:
+            _, own_terms, own_weights = found[name]
+            terms |= own_terms
+            weights |= own_weights
+        for name in () if self.settled else self.model.names("human"):
+            crop = view.crops.get(name)
+            if crop is not None:
+                more = self._human(name, frame, crop, camera, state, composite)
+                terms |= more
+                weights |= dict.fromkeys(more, self.weights["human"])
         start = 0
         for objective, channel in zip(further, channels, strict=True):
             shown = None
             if channel is not None and composite.features is not None:
                 end = start + channel.shape[1]
                 shown, start = composite.features[..., start:end], end
-            found = objective.terms(at, composite, shown)
-            terms |= found
-            weights |= dict.fromkeys(found, objective.weight)
-        for name in self.model.entities:
-            if self.settled and self.model.entity(name).kind != "scene":
-                continue
-            own = None if deformed.penalties is None else deformed.penalties[name]
-            self._regularize(name, state.gaussians[name], own, terms, weights)
+            more = objective.terms(at, composite, shown)
+            terms |= more
+            weights |= dict.fromkeys(more, objective.weight)
         if self.cameras is not None:
             terms["regularizer/camera"] = self.cameras.penalty(frame.position)
             weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
@@ -218,6 +210,52 @@ class JointObjective:
         if not total.requires_grad:  # no term applies to this frame
             total = total + 0 * composite.color.sum()
         return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
+
+    def _of_composite(
+        self, view: TrainingView, camera: Camera, state: SceneState, request: RenderRequest
+    ) -> Part:
+        """The render of all entities, and its terms."""
+        frame, offsets = view.frame, request.screen_offsets
+        assert offsets is not None
+        composite = self.model.draw(state.joined(), camera, request)
+        terms = self._composite(view, composite)
+        terms |= self._scene_alone(
+            frame, camera, state, composite, offsets, request.absolute_gradients
+        )
+        if frame.depth is not None and self.weights["depth"] > 0:
+            prior = frame.depth * self.depth_scale
+            if frame.ignored is not None:
+                prior = prior.masked_fill(frame.ignored, 0.0)  # 0 = unknown
+            depth = depth_loss(
+                composite.depth, composite.alpha, prior, self.depth_kind, self.spec.depth_fit
+            )
+            if depth is not None:
+                terms["depth"] = depth
+        return composite, terms, {name: self._weight_of_kind(name) for name in terms}
+
+    def _of_entity(
+        self,
+        name: str,
+        view: TrainingView,
+        camera: Camera,
+        deformed: Deformed,
+        backgrounds: Mapping[str, Float[Tensor, "3"]],
+    ) -> Part:
+        """The terms of an entity alone: of its render, and penalties."""
+        terms: dict[str, Tensor] = {}
+        kind, crop = self.model.entity(name).kind, view.crops.get(name)
+        if crop is not None and name in backgrounds:
+            terms = self._alone(name, kind, crop, camera, deformed.state, backgrounds[name])
+        weights = {name: self._weight_of_kind(name) for name in terms}
+        own = None if deformed.penalties is None else deformed.penalties[name]
+        self._regularize(name, deformed.state.gaussians[name], own, terms, weights)
+        return None, terms, weights
+
+    def _weight_of_kind(self, term: str) -> float:
+        return self.weights[term.partition("/")[0]]
+
+    def _is_scene(self, name: str) -> bool:
+        return self.model.entity(name).kind == "scene"
 
     def _settled(self, state: SceneState) -> SceneState:
         """Without gradients but of scenes."""

@@ -14,6 +14,7 @@ from torch.func import functional_call
 
 from hoigs.core.errors import PluginError
 from hoigs.core.fast.graphs import capturing, why_not_cuda_graph_safe
+from hoigs.core.fast.streams import side_by_side
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.spec.train_schema import Graphs
@@ -384,7 +385,7 @@ class _CapturedStep:
         stream.wait_stream(current)
         graph = torch.cuda.CUDAGraph()
         # set the stream here too: a capture that fails does not restore the previous one
-        with torch.cuda.device(stream.device), torch.cuda.stream(stream):
+        with torch.cuda.device(stream.device), torch.cuda.stream(stream), side_by_side({}):
             self._compute()  # what only a first call does
             with capturing(graph, stream):
                 self._compute()

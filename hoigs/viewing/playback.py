@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hoigs.core.errors import PluginError, RenderError
 from hoigs.core.fast.graphs import capturing
+from hoigs.core.fast.streams import side_by_side
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.model.scene import SceneModel, SceneState
 from hoigs.core.values.camera import Camera
@@ -277,7 +278,7 @@ class Playback:
         side = torch.cuda.Stream(device)
         side.wait_stream(torch.cuda.current_stream(device))
         # set the stream here too, as a failed capture does not restore the previous one
-        with torch.no_grad(), torch.cuda.device(device), torch.cuda.stream(side):
+        with torch.no_grad(), torch.cuda.device(device), torch.cuda.stream(side), side_by_side({}):
             for moment, camera in self._views:  # compiles kernels, fills caches, sizes buffers
                 self._packed.copy_(self._pack(moment, camera))
                 self._deform()

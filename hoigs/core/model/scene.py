@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from hoigs.core.errors import HoigsError, require_type
+from hoigs.core.fast.streams import apart
 from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.interfaces.interaction import InteractionModule
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
@@ -18,7 +20,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.shown import html_table
-from hoigs.core.values.tokens import Residual, Tokens
+from hoigs.core.values.tokens import Residual, Role, Tokens
 
 
 @dataclass(frozen=True)
@@ -154,21 +156,27 @@ class SceneModel(nn.Module):
         residuals: Mapping[str, Residual] = {}
         module = self.interaction
         if module is not None and module.reads and self.interaction_enabled:
-            for name in self.entities:
+            seen = apart({n: partial(self._described, n, moment) for n in self.entities}, moment)
+            for name, (described, _) in seen.items():
                 features = self.entity(name).features
-                role = f"features of {name!r}"
-                described = call(features, role, self.entity(name).tokens, moment)
                 if described is not None and features is not None:
                     require_tokens(features, name, described, len(self.entity(name)))
                     tokens[name], extractors[name] = described, features
-            roles = {name: self.entity(name).role(moment) for name in self.entities}
+            roles = {name: role for name, (_, role) in seen.items()}
             residuals = call(module, "interaction", module, tokens, roles)
             require_residuals(module, residuals, tokens, extractors, self.count())
-        gaussians = {}
-        for name in names:
-            entity, role = self.entity(name), f"deformation of {name!r}"
-            gaussians[name] = call(entity.deformation, role, entity, moment, residuals.get(name))
-        return SceneState(gaussians, residuals, tokens)
+        moved = {name: partial(self._moved, name, moment, residuals.get(name)) for name in names}
+        return SceneState(apart(moved, (moment, residuals)), residuals, tokens)
+
+    def _described(self, name: str, moment: Moment) -> tuple[Tokens | None, Role]:
+        """What the interaction reads of an entity."""
+        entity = self.entity(name)
+        tokens = call(entity.features, f"features of {name!r}", entity.tokens, moment)
+        return tokens, entity.role(moment)
+
+    def _moved(self, name: str, moment: Moment, residual: Residual | None) -> Gaussians:
+        entity = self.entity(name)
+        return call(entity.deformation, f"deformation of {name!r}", entity, moment, residual)
 
     def render(
         self,
