@@ -22,6 +22,8 @@ KERNELS = {
     "hoigs.core.maths.rotations.turned_quats": "skin",
     "hoigs.core.maths.skinning.skin_gaussians": "skin",
 }
+# Likewise on CUDA.
+CUDA_KERNELS = {"hoigs.core.maths.feature_planes.sample_planes": "planes_cuda"}
 # By fewer operations of torch, for tensors of any kind anywhere.
 BATCHED = {
     "hoigs.core.maths.skinning.joint_transforms": batched.joint_transforms,
@@ -30,13 +32,17 @@ BATCHED = {
 }
 
 
-def _by_kernel(function: str, module: str, args: tuple[Any, ...]) -> Callable[..., Any] | None:
-    """The function of `module`; None, too, with a warning, where its kernels do not compile."""
+def _by_kernel(name: str, args: tuple[Any, ...]) -> Callable[..., Any] | None:
+    """The function by kernels; None, too, with a warning, where those of a CPU do not compile."""
     tensors = [x for x in args if isinstance(x, Tensor)]
-    on_cpu = all(x.device.type == "cpu" for x in tensors)
-    if on_cpu and all(x.dtype == torch.float32 or not x.is_floating_point() for x in tensors):
-        return getattr(_compiled(module), function, None)
-    return None
+    kinds = {x.device.type for x in tensors}
+    single = all(x.dtype == torch.float32 or not x.is_floating_point() for x in tensors)
+    module = None
+    if single and kinds == {"cpu"} and name in KERNELS:
+        module = _compiled(KERNELS[name])
+    elif single and kinds == {"cuda"} and name in CUDA_KERNELS:
+        module = importlib.import_module(f"hoigs.core.fast.{CUDA_KERNELS[name]}")
+    return getattr(module, name.rpartition(".")[2], None)
 
 
 @functools.cache
@@ -52,7 +58,7 @@ def _compiled(name: str) -> ModuleType | None:
     return module
 
 
-for _name, _module in KERNELS.items():
-    replace(_name, functools.partial(_by_kernel, _name.rpartition(".")[2], _module))
+for _name in {*KERNELS, *CUDA_KERNELS}:
+    replace(_name, functools.partial(_by_kernel, _name))
 for _name, _function in BATCHED.items():
     replace(_name, functools.partial(lambda function, args: function, _function))

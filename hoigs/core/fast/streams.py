@@ -33,10 +33,16 @@ def side_by_side(streams: dict[str, torch.cuda.Stream]) -> Iterator[None]:
         streams: by name of the work; `apart` adds those that it misses.
     """
     token = _now.set(streams)
+    # parameters are read on several streams: autograd waits for these, and newer versions warn
+    warn = getattr(torch.autograd.graph, "set_warn_on_accumulate_grad_stream_mismatch", None)
+    if warn is not None:
+        warn(False)
     try:
         yield
     finally:
         _now.reset(token)
+        if warn is not None:
+            warn(True)
 
 
 def apart(works: Mapping[str, Callable[[], T]], inputs: Any = None) -> dict[str, T]:

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int32, UInt8
 from torch import Tensor
 
+from hoigs.core.fast.cuda_launch import CudaStreams
 from hoigs.core.fast.launch import CPU_FLAGS, prepared
 from hoigs.core.first_order import first_order
 from hoigs.core.system.quiet_warp import wp
 from hoigs.metrics.kernels.tiles import SIDE, THREADS, backward, forward
-from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.records import F32, I32, U8
 
 # C++ of the image loss's kernels; the stages are those of SSIM (`warp.ssim.tile_source`).

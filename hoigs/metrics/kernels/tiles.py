@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from hoigs.core.fast.cuda_launch import CudaStreams
 from hoigs.core.fast.launch import CPU_FLAGS, prepared
 from hoigs.core.system.quiet_warp import wp
 from hoigs.metrics.kernels.definition import FORMULA, WEIGHTS
-from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.records import F32
 
 # C++ of the CUDA kernels of SSIM, and the same code for a CPU, so that tests can run it.

@@ -24,10 +24,10 @@ def test_only_float32_on_cpus() -> None:
 
 
 def test_what_is_replaced_is_there_and_replaceable() -> None:
-    for name in (*choose.KERNELS, *choose.BATCHED):
+    for name in (*choose.KERNELS, *choose.CUDA_KERNELS, *choose.BATCHED):
         module, _, function = name.rpartition(".")
         assert hasattr(getattr(importlib.import_module(module), function), "__wrapped__"), name
-    for name, kernels in choose.KERNELS.items():
+    for name, kernels in (*choose.KERNELS.items(), *choose.CUDA_KERNELS.items()):
         module = importlib.import_module(f"hoigs.core.fast.{kernels}")
         assert callable(getattr(module, name.rpartition(".")[2]))
 

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from hoigs.core.device import replacement
+from hoigs.core.fast import choose
 from hoigs.core.maths.feature_planes import PairedPlanes, ProductPlanes, roughness, sample_planes
 
 
@@ -34,20 +35,69 @@ def everything(planes: Tensor, points: Tensor, upstream: Tensor) -> list[Tensor]
     return [samples.detach(), *torch.autograd.grad(samples, (planes, points), upstream)]
 
 
-@pytest.mark.parametrize(
-    ("shape", "count"),
-    [((3, 16, 12, 32), 3000), ((2, 9, 1, 37), 700), ((1, 1, 6, 16), 10), ((3, 4, 5, 3), 0)],
-)
-def test_the_cpu_kernel_equals_its_float64_twin(shape: tuple[int, ...], count: int) -> None:
+SHAPES = [((3, 16, 12, 32), 3000), ((2, 9, 1, 37), 700), ((1, 1, 6, 16), 10), ((3, 4, 5, 3), 0)]
+
+
+def close_to_its_twin(
+    shape: tuple[int, ...], count: int, device: str = "cpu", scale: float = 1.0
+) -> None:
     torch.manual_seed(0)
     planes, points = torch.randn(shape), torch.rand(shape[0], count, 2) * 2.6 - 1.3
-    upstream = torch.randn(count, shape[0] * shape[3])
-    assert replacement(sample_planes, planes) and not replacement(sample_planes, planes.double())
-    found = everything(planes, points, upstream)
+    points[:, :2] = torch.tensor((-1.0, 1.0))  # edges
+    upstream = scale * torch.randn(count, shape[0] * shape[3])
     exact = everything(planes.double(), points.double(), upstream.double())
+    found = everything(planes.to(device), points.to(device), upstream.to(device))
     for ours, theirs in zip(found, exact, strict=True):
         bound = 2e-6 * float(theirs.abs().amax()) if count else 0.0
-        torch.testing.assert_close(ours.double(), theirs, rtol=0, atol=bound)
+        torch.testing.assert_close(ours.cpu().double(), theirs, rtol=0, atol=bound)
+
+
+@pytest.mark.parametrize(("shape", "count"), SHAPES)
+def test_the_cpu_kernel_equals_its_float64_twin(shape: tuple[int, ...], count: int) -> None:
+    planes = torch.zeros(shape)
+    assert replacement(sample_planes, planes) and not replacement(sample_planes, planes.double())
+    close_to_its_twin(shape, count)
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1.0, 1e20])
+@pytest.mark.parametrize(("shape", "count"), SHAPES)
+def test_the_cuda_kernel_as_scalar_code_equals_its_float64_twin(
+    shape: tuple[int, ...], count: int, scale: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(
+        choose.KERNELS, "hoigs.core.maths.feature_planes.sample_planes", "planes_cuda"
+    )
+    close_to_its_twin(shape, count, scale=scale)
+
+
+@pytest.mark.parametrize("value", [0.0, torch.inf, torch.nan])
+def test_the_cuda_kernel_of_gradients_that_vanish_or_are_none(
+    value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(
+        choose.KERNELS, "hoigs.core.maths.feature_planes.sample_planes", "planes_cuda"
+    )
+    upstream = torch.zeros(5, 12)
+    upstream[2, 3] = value
+    _, planes, _ = everything(torch.randn(3, 4, 5, 4), torch.rand(3, 5, 2), upstream)
+    assert (planes == 0).all() if value == 0 else not torch.isfinite(planes).all()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize(("shape", "count"), SHAPES)
+def test_the_cuda_kernel_equals_its_float64_twin(shape: tuple[int, ...], count: int) -> None:
+    assert replacement(sample_planes, torch.zeros(1, device="cuda")) is not None
+    close_to_its_twin(shape, count, "cuda")
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_the_cuda_kernel_gives_the_same_bits_in_every_run() -> None:
+    torch.manual_seed(0)
+    values = torch.randn(3, 8, 8, 32), torch.rand(3, 20_000, 2) * 2 - 1, torch.randn(20_000, 96)
+    first, second = (everything(*(x.cuda() for x in values)) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
 def test_the_cpu_kernel_gives_the_same_bits_on_any_number_of_cores() -> None:

@@ -3,5 +3,4 @@
 pipeline        CudaPipeline: the stages of a render
 intersections   tile intersections without waiting for the device
 capacity        for how many intersections memory is allocated
-launch          launching kernels with little overhead
 """

@@ -23,9 +23,9 @@ import torch
 from torch import Tensor
 
 from hoigs.core.errors import RenderError
+from hoigs.core.fast.cuda_launch import CudaStream, CudaStreams
 from hoigs.rasterizers.warp.arguments import Projected
 from hoigs.rasterizers.warp.blend.pixel_source import TILE_HEIGHT
-from hoigs.rasterizers.warp.cuda.launch import CudaStream, CudaStreams
 from hoigs.rasterizers.warp.frame import INT32, Settings, TileIntersections, check_addressable
 from hoigs.rasterizers.warp.intersect import cuda_kernels
 from hoigs.rasterizers.warp.intersect.cuda_source import BLOCK, PLAN_BLOCK, SORT_BLOCK

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from hoigs.core.fast.cuda_launch import CudaStreams
 from hoigs.rasterizers.warp.arguments import (
     Gradients,
     Projected,
@@ -22,7 +23,6 @@ from hoigs.rasterizers.warp.blend import (
     pixel_source,
 )
 from hoigs.rasterizers.warp.cuda.intersections import IntersectionCapacity, Intersector
-from hoigs.rasterizers.warp.cuda.launch import CudaStreams
 from hoigs.rasterizers.warp.frame import (
     Images,
     Inputs,

@@ -71,7 +71,9 @@ class CudaStreams:
         return found
 
 
-def _prepared(kernel: Any, block: int, arguments: Sequence[Any], stream: Any) -> tuple[Any, list]:
+def _prepared(
+    kernel: Any, block: int, arguments: Sequence[Any], stream: Any
+) -> tuple[Any, list[Any]]:
     """A launch, and its parameters to be filled in, each with whether it is an array."""
     sizes = vector_sizes(kernel, arguments)
     inputs = [
