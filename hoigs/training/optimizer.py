@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import torch
 from jaxtyping import Bool
@@ -17,6 +17,9 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
 from hoigs.core.values.tokens import EntityKind
 from hoigs.core.values.topology import AxisChange, TopologyChange
+
+if TYPE_CHECKING:
+    from hoigs.core.fast.adam import AdamKernel
 
 FIELD_RATES = {
     "means": "means",
@@ -34,6 +37,7 @@ WARMUPS = {
     "shape": "poses",
     "camera": "cameras",
 }
+STATE = ("exp_avg", "exp_avg_sq", "step")  # what torch's Adam keeps of a parameter
 SETTLE_FROM = 0.8  # share of a schedule after which rates without a `_final` decay by `settle`
 
 
@@ -166,6 +170,7 @@ class GroupedAdam:
             [{"params": members, "lr": s.start, "schedule": s} for s, members in groups.items()],
             lr=1e-3, eps=1e-15, fused=True,
         )  # fmt: skip
+        self._kernel: AdamKernel | None = None
         self.sh_rest = rates.sh_rest
         self.progress = 0.0
 
@@ -211,11 +216,34 @@ class GroupedAdam:
                     parameter.grad[:, (sh_degree + 1) ** 2 :] = 0
         slowed = [p for p in colors if p.shape[1] > 1] if self.sh_rest != 1 else []
         before = [parameter.detach()[:, 1:].clone() for parameter in slowed]
-        # what torch's own gradient scaler tells a fused optimizer
-        setattr(self.adam, "found_inf", None if finite is None else (~finite).float())  # noqa: B010
-        self.adam.step()
+        if finite is None:
+            self.adam.step()
+        else:
+            self._step_where(finite)
         for parameter, old in zip(slowed, before, strict=True):  # Adam's step is linear in its rate
             parameter.data[:, 1:].lerp_(old, 1 - self.sh_rest)
+
+    @torch.no_grad()
+    def _step_where(self, finite: Bool[Tensor, ""]) -> None:
+        """`self.adam.step()` by one kernel, and only where gradients were found to be finite."""
+        if self._kernel is None:
+            from hoigs.core.fast.adam import AdamKernel  # loads Warp
+
+            self._kernel = AdamKernel(self.adam.defaults["betas"], self.adam.defaults["eps"])
+        stepped, rates = [], []
+        for group in self.adam.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                state = self.adam.state[parameter]
+                if not state:
+                    state["step"] = torch.zeros((), device=parameter.device)
+                    state["exp_avg"] = torch.zeros_like(parameter)
+                    state["exp_avg_sq"] = torch.zeros_like(parameter)
+                stepped.append((parameter, parameter.grad, *map(state.get, STATE)))
+                rates.append(float(group["lr"]))
+        torch._foreach_add_([one[-1] for one in stepped], finite.float())
+        self._kernel(stepped, rates, finite)
 
     def zero_grad(self) -> None:
         self.adam.zero_grad(set_to_none=True)
