@@ -242,7 +242,6 @@ class GroupedAdam:
                     state["exp_avg_sq"] = torch.zeros_like(parameter)
                 stepped.append((parameter, parameter.grad, *map(state.get, STATE)))
                 rates.append(float(group["lr"]))
-        torch._foreach_add_([one[-1] for one in stepped], finite.float())
         self._kernel(stepped, rates, finite)
 
     def zero_grad(self) -> None:

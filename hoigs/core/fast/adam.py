@@ -89,8 +89,20 @@ def step_parameters(
 
 
 # A parameter's values and gradients, the means of these and of their squares, and how many steps
-# there were, this one included (a 0-d float32 tensor): contiguous, on one device.
+# there were (a 0-d float32 tensor): contiguous, on one device.
 Stepped = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+@wp.func_native("*(float*)((const long long*)table.data)[6 * which + 4] += 1.0f;")
+def count_native(which: int, table: I64): ...
+
+
+@wp.kernel
+def count_steps(table: I64, finite: U8, base: int, items: int):
+    """Of each parameter, before `step_parameters`."""
+    which = base + wp.tid()
+    if which < items and finite[0] != wp.uint8(0):
+        count_native(which, table)
 
 
 class AdamKernel:
@@ -108,7 +120,7 @@ class AdamKernel:
     def __call__(
         self, parameters: Sequence[Stepped], rates: Sequence[float], finite: Bool[Tensor, ""]
     ) -> None:
-        """Change values and moments.
+        """Change values and moments, and count the step.
 
         Args:
             rates: of each parameter. finite: on the device; where it is False nothing changes.
@@ -118,12 +130,16 @@ class AdamKernel:
         device = parameters[0][0].device
         blocks, table = self._places(parameters, device)
         now = torch.tensor(rates, dtype=torch.float64).to(device, non_blocking=True)
-        arguments = [blocks, table, now, *self._numbers, finite.view(1).view(torch.uint8)]
+        taken = finite.view(1).view(torch.uint8)
+        arguments = [blocks, table, now, *self._numbers, taken]
         count = len(blocks) // 2
         if device.type == "cuda":
             with torch.cuda.device(device):
-                self._streams.current().blocks(step_parameters, count, THREADS, arguments)
+                stream = self._streams.current()
+                stream.each(count_steps, len(parameters), [table, taken])
+                stream.blocks(step_parameters, count, THREADS, arguments)
         else:
+            prepared(count_steps, len(parameters), [table, taken, 0, len(parameters)]).launch()
             prepared(step_parameters, count, arguments).launch()
 
     def _places(self, parameters: Sequence[Stepped], device: torch.device) -> tuple[Tensor, Tensor]:
