@@ -106,6 +106,9 @@ class StepGradients:
             self._release()
             self._key = _StepKey(objective, view, self._least)
             return self._eager(view, camera, backgrounds)
+        memory = self._model.rasterizer.graph_memory(self._model.device)
+        if self._captured is not None and self._captured.drawn != memory:
+            self._release()  # and captured at once: an eager step would round in another way
         if self._captured is None:
             self._capture(view, backgrounds)
             if self._captured is None:
@@ -169,7 +172,7 @@ class StepGradients:
         if failure is None:
             self._captured = made
             self._compared.add(self._key.structure)
-            self._key.drawn = self._model.rasterizer.graph_memory(self._model.device)
+            made.drawn = self._model.rasterizer.graph_memory(self._model.device)
             self.captures += 1
             return
         self.mode, self.reason = "plain", failure
@@ -238,7 +241,6 @@ class _StepKey(GraphKey):
 
     Attributes:
         size: height and width of the pictures.
-        drawn: the rasterizer's `graph_memory` when it was captured.
     """
 
     def __init__(self, objective: JointObjective, view: TrainingView, needs: _Needs) -> None:
@@ -246,15 +248,13 @@ class _StepKey(GraphKey):
         self._settled, self._needs = objective.settled, needs
         self.size = _size(view)
         self.structure = (self.structure, self._settled, needs)
-        self.drawn: int | None = None
 
     def holds(self, objective: JointObjective, view: TrainingView, needs: _Needs) -> bool:  # type: ignore[override]
         model = objective.model
         same = self._settled == objective.settled and self._needs == needs
         if not same or _size(view) != self.size:
             return False
-        memory = model.rasterizer.graph_memory(model.device)
-        return self.drawn in (None, memory) and super().holds(model, view.frame.moment)
+        return super().holds(model, view.frame.moment)
 
 
 def _size(view: TrainingView) -> tuple[int, int]:
@@ -373,7 +373,12 @@ class _CapturedStep:
 
     Args:
         stream: to capture on; None launches kernel by kernel, the same in every other respect.
+
+    Attributes:
+        drawn: the rasterizer's `graph_memory` when it was captured.
     """
+
+    drawn = 0
 
     def __init__(self, step: _Step, memory: ViewMemory, stream: torch.cuda.Stream | None) -> None:
         self._step, self.memory = step, memory
