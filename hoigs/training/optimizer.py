@@ -10,10 +10,10 @@ from typing import get_args
 import torch
 from torch import nn
 
-from hoigs.core.errors import SpecError, did_you_mean
+from hoigs.core.errors import PluginError, SpecError, did_you_mean
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
+from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec, rate_names
 from hoigs.core.values.tokens import EntityKind
 from hoigs.core.values.topology import AxisChange, TopologyChange
 
@@ -106,7 +106,7 @@ class GroupedAdam:
         steps: of the training. settled: after which people, objects and the interaction are done.
 
     Raises:
-        ValueError: a component declares a rate that `train.rates` does not have.
+        PluginError: a component declares a rate that `train.rates` does not have.
         SpecError: `rates.by_entity` names an entity that the model does not have.
     """
 
@@ -137,8 +137,10 @@ class GroupedAdam:
             own = rates if entity is None else rates.of(name.split(".")[1], entity.kind)
             start = getattr(own, rate, None)
             if start is None:
-                known = sorted(RatesSpec.model_fields)
-                raise ValueError(f"{name} declares the rate {rate!r}; train.rates has {known}")
+                rates_known = ", ".join(rate_names())
+                raise PluginError(
+                    f"{name} declares the rate {rate!r}; train.rates has {rates_known}"
+                )
             final = getattr(own, f"{rate}_final", None)
             settles = final is None and own.settle < 1
             if final is None:

@@ -63,3 +63,13 @@ def test_the_right_one_passes_and_every_check_has_a_mutant(kind) -> None:
 def test_a_check_kills_its_mutant_alone(kind, id, kill) -> None:
     checks, subject, mutants, _, config = KINDS[kind]
     kill(checks, subject(mutants[id], config), id, mutants[id].__name__)
+
+
+def test_tokens_that_an_interaction_needs_are_declared() -> None:
+    """One that gives a residual for each token, and does not say that it needs one for each."""
+    made = interaction.InteractionSubject(
+        interaction_mutants.OneForEachToken, interaction_mutants.RightConfig()
+    )
+    (failed,) = [r for r in run_checks(interaction.CHECKS, made).results if r.id == "I01"]
+    assert "[5, 3]" in failed.why and "[7, 3]" in failed.why, failed.why
+    assert 'tokens = {"object": "gaussian"}' in failed.why

@@ -103,10 +103,12 @@ class Entity(nn.Module):
         return self.features(self.deformation, self.canonical, moment)
 
     def role(self, moment: Moment) -> Role:
-        """The entity's kind and, of a human with a skeleton, where its reach begins and ends."""
+        """The entity's kind and number of Gaussians and, of a human with a skeleton, where its
+        reach begins and ends."""
         if self.kind == "human" and isinstance(self.deformation, ProvidesSkeleton):
-            return Role("human", self.deformation.anchors(moment), self.deformation.arm_length())
-        return Role(self.kind)
+            anchors, reach = self.deformation.anchors(moment), self.deformation.arm_length()
+            return Role("human", anchors, reach, len(self))
+        return Role(self.kind, gaussians=len(self))
 
     def forward(self, moment: Moment, residual: Residual | None = None) -> Gaussians:
         """The entity at `moment`: raw Gaussians in the world."""

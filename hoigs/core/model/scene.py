@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hoigs.core.errors import HoigsError, require_type
 from hoigs.core.interfaces.features import FeatureExtractor
-from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.interfaces.interaction import InteractionModule, check_tokens
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
 from hoigs.core.model.entity import Entity, call, require_residuals, require_tokens
 from hoigs.core.system.files import require_entity_name
@@ -70,7 +70,8 @@ class SceneModel(nn.Module):
         interaction_enabled: False during the warm-up of the interaction.
 
     Raises:
-        ValueError: there are no entities, or one has a name that none can have.
+        ValueError: there are no entities, one has a name that none can have, or its features
+            declare other tokens than the interaction needs.
         TypeError: an argument is of another type.
         HoigsError: parameters of several dtypes, or of float32 where torch's default is another.
     """
@@ -100,10 +101,12 @@ class SceneModel(nn.Module):
         self.low_pass = low_pass
         self.antialiased = antialiased
         if interaction is not None:
-            described = {n: e for n, e in entities.items() if e.features is not None}
+            described = {n: e.features for n, e in entities.items() if e.features is not None}
+            for name, features in described.items():
+                check_tokens(interaction, features, entities[name].kind)
             interaction.bind(
-                {n: e.features.width for n, e in described.items() if e.features is not None},
-                {n: e.kind for n, e in entities.items()},
+                {name: features.width for name, features in described.items()},
+                {name: entity.kind for name, entity in entities.items()},
             )
         self._check_dtypes()
 

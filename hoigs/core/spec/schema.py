@@ -22,7 +22,7 @@ from pydantic import (
     field_validator,
 )
 
-from hoigs.core.errors import PluginError, SpecError
+from hoigs.core.errors import PluginError, SpecError, did_you_mean
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.files import (
@@ -31,7 +31,7 @@ from hoigs.core.spec.files import (
     read_spec,
 )
 from hoigs.core.spec.loader import Document, Place, dump_yaml, load_overrides, load_yaml
-from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec
+from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec, rate_names
 from hoigs.core.system.files import NAME, RULE
 
 # Names that specs of version 0.1 used, read as the present ones.
@@ -363,17 +363,21 @@ KINDS = ("scene", "human", "object")  # blocks of other names are of one entity,
 
 
 def require_fitting(spec: Spec, registry: Registry) -> None:
-    """Refuse a deformation of other kinds of entity, and features that require what it lacks.
+    """Refuse a deformation of other kinds of entity, features that require what it lacks or give
+    other tokens than the interaction needs, and rates that `train.rates` does not have.
 
-    `compose` refuses both, too; here no clip is needed. A spec is not checked when it is loaded: a
+    `compose` refuses these, too; here no clip is needed. A spec is not checked when it is loaded: a
     search changes one component after the other.
 
     Raises:
         SpecError: a line for each, with its position.
     """
     from hoigs.core.interfaces.features import check_provided
+    from hoigs.core.interfaces.interaction import check_tokens
 
-    found = []
+    found = _unknown_rates(spec, registry)
+    interaction = registry.get(spec.interaction.use)
+    name: Any  # an EntityKind, where it is one
     for name, block in spec.model.items():
         deformation = registry.get(block.deformation.use)
         if name in KINDS and name not in deformation.kinds:
@@ -382,8 +386,11 @@ def require_fitting(spec: Spec, registry: Registry) -> None:
                 f"entities of kind {' or '.join(sorted(deformation.kinds))}, not {name}"
             )
         elif block.features is not None:
+            features = registry.get(block.features.use)
             try:
-                check_provided(registry.get(block.features.use), deformation)
+                check_provided(features, deformation)
+                if name in KINDS:
+                    check_tokens(interaction, features, name)
             except ValueError as error:
                 parts = ("deformation", "features")  # of these, the one that a user wrote
                 places = [spec.at("model", name, part, "use") for part in parts]
@@ -391,3 +398,17 @@ def require_fitting(spec: Spec, registry: Registry) -> None:
                 found.append(f"{place}: {error}")
     if found:
         raise SpecError("\n".join(found))
+
+
+def _unknown_rates(spec: Spec, registry: Registry) -> list[str]:
+    """A line for each learning rate that a component declares and `train.rates` lacks."""
+    found, known = [], rate_names()
+    for place, part in spec.component_specs():
+        declared: Any = getattr(registry.get(part.use), "rates", {})
+        for prefix, rate in declared.items():
+            if rate not in known:
+                found.append(
+                    f'{spec.at(*map(str, place), "use")}: {part.use} declares rates["{prefix}"] as '
+                    f'"{rate}"{did_you_mean(rate, known)}; train.rates has {", ".join(known)}'
+                )
+    return found
