@@ -71,7 +71,7 @@ def render_time(
         start = _now(device)
         gaussians = model(moment).joined()
         middle = _now(device)
-        output = model.draw(gaussians, camera, RenderRequest())
+        output = model.draw(gaussians, camera, RenderRequest(), moment)
         end = _now(device)
         if step < warmup and not late:
             warmed += 1

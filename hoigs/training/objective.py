@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float, Shaped
@@ -124,6 +124,8 @@ class JointObjective:
         frame = view.frame
         deformed = self._deform(frame.moment)
         state = self._settled(deformed.state) if self.settled else deformed.state
+        if self.model.decoder is not None and state.moment is None:  # from a CUDA graph
+            state = replace(state, moment=frame.moment.to(device))
         offsets = torch.zeros(
             sum(len(g) for g in state.gaussians.values()), 2, device=device, requires_grad=True
         )
@@ -141,6 +143,7 @@ class JointObjective:
                 features=torch.cat(drawn, 1) if drawn else None,
                 screen_offsets=offsets, absolute_gradients=absolutes,
             ),
+            state.moment,
         )  # fmt: skip
         terms = self._composite(view, composite)
         terms |= self._scene_alone(frame, camera, state, composite, offsets, absolutes)
@@ -194,7 +197,7 @@ class JointObjective:
         """Without gradients but of scenes."""
         scenes = self.model.names("scene")
         kept = {n: g if n in scenes else g.detach() for n, g in state.gaussians.items()}
-        return SceneState(kept, state.residuals, state.tokens)
+        return replace(state, gaussians=kept, whole=None)
 
     def _deform(self, moment: Moment) -> Deformed:
         """A method of its own, so that benchmarks can time it."""
@@ -273,7 +276,7 @@ class JointObjective:
                 screen_offsets=_of(scenes, state, offsets),
                 absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
             )
-        return self.model.draw(state.joined(scenes), camera, request)
+        return self.model.draw(state.joined(scenes), camera, request, state.moment)
 
     def _alone(
         self,
@@ -293,7 +296,10 @@ class JointObjective:
             background = torch.rand(3, generator=generator)
         background = background.to(camera.K)
         output = self.model.draw(
-            state.gaussians[name], crop.seen_from(camera), RenderRequest(background=background)
+            state.gaussians[name],
+            crop.seen_from(camera),
+            RenderRequest(background=background),
+            state.moment,
         )
         compared = Comparison(
             crop.pixels, crop.mask, crop.ignore, background, area=crop.area

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import get_args
@@ -74,6 +74,12 @@ def trained_throughout(name: str, entity: Entity | None) -> bool:
     return name.startswith("cameras.") or (entity is not None and entity.kind == "scene")
 
 
+def rate_of(parameter: str, rates: Mapping[str, str]) -> str:
+    """The rate of a module's parameter, by the longest prefix that the module declares."""
+    prefixes = [prefix for prefix in rates if parameter.startswith(prefix)]
+    return rates[max(prefixes, key=len)] if prefixes else "networks"
+
+
 def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Entity | None]]:
     """Every trainable parameter with its dotted name, its rate's name and its entity."""
     for name in model.entities:
@@ -81,17 +87,13 @@ def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Ent
         for path, parameter in entity.named_parameters():
             head, _, tail = path.partition(".")
             module = getattr(entity, head) if tail else None
-            if module is None:
-                rate = FIELD_RATES[path]
-            else:
-                prefixes = [p for p in module.rates if tail.startswith(p)]
-                rate = module.rates[max(prefixes, key=len)] if prefixes else "networks"
+            rate = FIELD_RATES[path] if module is None else rate_of(tail, module.rates)
             if parameter.requires_grad:
                 yield f"entities.{name}.{path}", parameter, rate, entity
-    if model.interaction is not None:
-        for path, parameter in model.interaction.named_parameters():
+    for head, module in (("interaction", model.interaction), ("decoder", model.decoder)):
+        for path, parameter in () if module is None else module.named_parameters():
             if parameter.requires_grad:
-                yield f"interaction.{path}", parameter, "networks", None
+                yield f"{head}.{path}", parameter, rate_of(path, getattr(module, "rates", {})), None
 
 
 class GroupedAdam:

@@ -23,7 +23,6 @@ from torch.nn.functional import normalize
 
 from hoigs.core.interfaces.body import HEAD_PART
 from hoigs.core.interfaces.deformation import ProvidesTemplate, Template
-from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.maths.projection import project
 from hoigs.core.maths.spherical_harmonics import mean_colors
@@ -309,7 +308,7 @@ def blending_weights(model: SceneModel, drawn: Gaussians, camera: Camera) -> Flo
     """
     sh = torch.zeros(len(drawn), 1, 3, device=model.device, requires_grad=True)
     with torch.enable_grad():
-        color = model.draw(drawn.replace(sh=sh), camera, RenderRequest()).color
+        color = model.rasterize(drawn.replace(sh=sh), camera).color
         (gradient,) = torch.autograd.grad(color[..., 0].sum(), sh)
     return gradient[:, 0, 0] / SH_C0
 

@@ -18,12 +18,10 @@ from hoigs.core.interfaces.body import PART_NAMES
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesSkeleton
 from hoigs.core.interfaces.features import FeatureExtractor, check_provided
 from hoigs.core.interfaces.interaction import InteractionModule
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.gaussians import FIELDS, Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import POSE_JOINTS, EntityKind, Residual, Role, Tokens
 from hoigs.core.values.topology import TopologyChange, share_opacity
-
-FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
 class Entity(nn.Module):
