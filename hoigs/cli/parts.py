@@ -248,6 +248,7 @@ class NewKind(StrEnum):
     rasterizer = "rasterizer"
     exporter = "exporter"
     objective = "objective"
+    decoder = "decoder"
 
 
 SUMMARIES = {
@@ -257,6 +258,7 @@ SUMMARIES = {
     NewKind.density: "removes what can hardly be seen",
     NewKind.reader: "a folder with scene.npz and images",
     NewKind.rasterizer: "plain torch, every splat at every pixel",
+    NewKind.decoder: "colours that change with the time and the direction of view",
     NewKind.objective: "depth that is even where the picture is",
     NewKind.exporter: "a text file of positions and opacities for each moment",
 }

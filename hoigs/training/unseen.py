@@ -26,12 +26,12 @@ from hoigs.core.interfaces.deformation import ProvidesTemplate, Template
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.maths.projection import project
 from hoigs.core.maths.spherical_harmonics import mean_colors
-from hoigs.core.model.entity import FIELDS, Entity
+from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import TrainSpec
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
-from hoigs.core.values.gaussians import SH_C0, Gaussians
+from hoigs.core.values.gaussians import FIELDS, SH_C0, Gaussians
 
 # Values of points that were seen, continued over those that were not.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import body_mutants
+import decoder_mutants
 import density_mutants
 import exporter_mutants
 import features_mutants
@@ -14,7 +15,16 @@ import pytest
 import reader_mutants
 
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.testing import body, density, exporter, features, interaction, objective, reader
+from hoigs.testing import (
+    body,
+    decoder,
+    density,
+    exporter,
+    features,
+    interaction,
+    objective,
+    reader,
+)
 from hoigs.testing.checks import run_checks
 from hoigs.testing.material import TinyBody
 
@@ -23,6 +33,10 @@ KINDS: dict[str, tuple[Any, ...]] = {
     "density": (
         density.CHECKS, density.DensitySubject, density_mutants.MUTANTS,
         density_mutants.RightDensity, density_mutants.RightDensityConfig(),
+    ),
+    "decoder": (
+        decoder.CHECKS, decoder.DecoderSubject, decoder_mutants.MUTANTS,
+        decoder_mutants.Right, decoder_mutants.RightConfig(),
     ),
     "body": (
         body.CHECKS, body.BodySubject, body_mutants.MUTANTS, TinyBody, body_mutants.TinyConfig(),

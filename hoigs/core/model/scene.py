@@ -239,20 +239,25 @@ class SceneModel(nn.Module):
         request, channels = request or RenderRequest(), gaussians.channels
         if channels is None:
             channels = gaussians.means.new_zeros(len(gaussians), decoder.channels)
-        asked = 0 if request.features is None else request.features.shape[1]
-        if asked:
-            channels = torch.cat((request.features, channels), 1)
+        asked = gaussians.means.new_zeros(len(gaussians), 0)
+        if request.features is not None:
+            asked = request.features
+        both = torch.cat((asked, channels), 1)
         drawn = self.rasterize(
-            gaussians, camera, request.replace(features=channels if channels.shape[1] else None)
+            gaussians, camera, request.replace(features=both if both.shape[1] else None)
         )
-        own = drawn.features[..., asked:] if decoder.channels else None
-        color = call(decoder, "decoder", decoder, replace(drawn, features=own), camera, moment)
+        further = own = None
+        if drawn.features is not None:
+            further, own = drawn.features.split((asked.shape[1], channels.shape[1]), -1)
+        drawn = replace(drawn, features=own if decoder.channels else None)
+        color = call(decoder, "decoder", decoder, drawn, camera, moment)
         if color.shape != drawn.color.shape:
             raise PluginError(
                 f"decoder: {name_of(decoder)} gave a picture {list(color.shape)}, expected "
                 f"{list(drawn.color.shape)}"
             )
-        return replace(drawn, color=color, features=drawn.features[..., :asked] if asked else None)
+        features = None if request.features is None else further
+        return replace(drawn, color=color, features=features)
 
     def _require_channels(self, role: str, part: object, gaussians: Gaussians) -> None:
         """Raise PluginError where channels are no row a Gaussian, or not those that are decoded."""
