@@ -35,11 +35,11 @@ def rows(tracks: Path) -> dict[str, tuple[str | Path, tuple[str, ...]]]:
     given = f"objectives.tracks.path={tracks}"
     return {
         "static 3DGS": ("static-3dgs", SAME),
-        "4DGS": ("4dgs", (*SAME, "train.rates.planes=8e-3", "train.rates.networks=8e-4")),
         "SpacetimeGaussians, no decoder": (stg, ("decoder=null",)),
         "SpacetimeGaussians": (stg, ()),
         "Shape of Motion, no tracks": (som, (given, "objectives.tracks.weight=0")),
         "Shape of Motion": (som, (given,)),
+        "4DGS": ("4dgs", (*SAME, "train.rates.planes=8e-3", "train.rates.networks=8e-4")),
     }
 
 
@@ -60,7 +60,7 @@ def scores(clip: str, spec: str | Path, settings: tuple[str, ...], out: Path) ->
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--clip", default="builtin:carry")
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--width", type=int, default=96)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()

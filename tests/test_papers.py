@@ -33,8 +33,8 @@ def test_a_port_is_an_afternoon_long(file):
 @pytest.mark.parametrize(
     ("key", "kit"),
     [
-        pytest.param("deformation:spacetime-polynomial", deformation, marks=pytest.mark.slow),
-        pytest.param("deformation:se3-bases", deformation, marks=pytest.mark.slow),
+        ("deformation:spacetime-polynomial", deformation),
+        ("deformation:se3-bases", deformation),
         ("decoder:spacetime-features", decoder),
     ],
 )
