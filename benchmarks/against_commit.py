@@ -78,7 +78,7 @@ def serve(options: argparse.Namespace) -> None:
 
         def forward_and_backward() -> None:
             made = human(moment()[0])
-            sum((x * x.detach()).sum() for x in vars(made).values()).backward()
+            sum((x * x.detach()).sum() for x in vars(made).values() if x is not None).backward()
             model.zero_grad(set_to_none=True)
 
         def pose() -> None:

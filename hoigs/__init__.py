@@ -35,6 +35,7 @@ _PUBLIC = {
     "ObjectInitializer": "hoigs.core.interfaces.initializer",
     "BodyModel": "hoigs.core.interfaces.body",
     "ClipReader": "hoigs.core.interfaces.reader",
+    "Decoder": "hoigs.core.interfaces.decoder",
     "DeformationModel": "hoigs.core.interfaces.deformation",
     "DensityControl": "hoigs.core.interfaces.density",
     "FeatureExtractor": "hoigs.core.interfaces.features",

@@ -8,6 +8,7 @@ from hoigs.core.errors import HoigsError as HoigsError
 from hoigs.core.interfaces.body import BodyModel as BodyModel
 from hoigs.core.interfaces.body import BodyModel as _BodyModel
 from hoigs.core.interfaces.body import BodySurface as _BodySurface
+from hoigs.core.interfaces.decoder import Decoder as Decoder
 from hoigs.core.interfaces.deformation import DeformationModel as DeformationModel
 from hoigs.core.interfaces.density import DensityControl as DensityControl
 from hoigs.core.interfaces.estimator import Estimator as Estimator

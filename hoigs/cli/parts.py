@@ -153,12 +153,19 @@ def as_text(page: dict[str, Any]) -> str:
             lines.append(f"{name + ':':<18} {one_line(str(value))}")
     if page.get("settings") is not None:
         lines.append("settings:" if page["settings"] else "settings:          none")
-        for row in page["settings"]:
-            default = "required" if row["default"] is None else f"default {row['default']}"
-            lines.append(f"    {row['name']}: {row['type']}; {default}")
-            if row["meaning"]:
-                lines.append(f"        {row['meaning']}")
+        lines += settings_lines(page["settings"], "    ")
     return "\n".join(lines)
+
+
+def settings_lines(rows: Sequence[Mapping[str, Any]], indent: str = "") -> list[str]:
+    """Each setting with its type and default, and below it what it means."""
+    lines = []
+    for row in rows:
+        default = "required" if row["default"] is None else f"default {row['default']}"
+        lines.append(f"{indent}{row['name']}: {row['type']}; {default}")
+        if row["meaning"]:
+            lines.append(f"{indent}    {one_line(row['meaning'])}")
+    return lines
 
 
 def one_line(text: str) -> str:
@@ -241,6 +248,7 @@ class NewKind(StrEnum):
     rasterizer = "rasterizer"
     exporter = "exporter"
     objective = "objective"
+    decoder = "decoder"
 
 
 SUMMARIES = {
@@ -250,6 +258,7 @@ SUMMARIES = {
     NewKind.density: "removes what can hardly be seen",
     NewKind.reader: "a folder with scene.npz and images",
     NewKind.rasterizer: "plain torch, every splat at every pixel",
+    NewKind.decoder: "colours that change with the time and the direction of view",
     NewKind.objective: "depth that is even where the picture is",
     NewKind.exporter: "a text file of positions and opacities for each moment",
 }
@@ -451,9 +460,9 @@ def _row(key: str, plugin: Any, status: str, error: str, component: Any) -> dict
     }
 
 
-# `hoigs spec list|check|show`: built-in specs and spec files.
+# `hoigs spec list|check|show|keys`: built-in specs and spec files.
 
-spec_app = typer.Typer(help="List, check and show specs.", no_args_is_help=True)
+spec_app = typer.Typer(help="List, check and show specs and their keys.", no_args_is_help=True)
 NameOrFile = Annotated[
     str,
     typer.Argument(help="A built-in spec's name, or a .yaml or .toml file; @PROFILE may follow."),
@@ -491,6 +500,31 @@ def check_spec(spec: NameOrFile, settings: SetOption = None, plugin: PluginOptio
 def show_spec(spec: NameOrFile, settings: SetOption = None, plugin: PluginOption = None) -> None:
     """Print a spec with all defaults; the output is a spec."""
     typer.echo(_load(spec, settings, plugin).dump(), nl=False)
+
+
+@spec_app.command("keys")
+def spec_keys(
+    under: Annotated[
+        str, typer.Argument(help="List those below a key only: train.rates, model.human.")
+    ] = "",
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Every key of a spec with its type, default and meaning; those of a component are listed by
+    `hoigs plugins show`."""
+    from hoigs.core.errors import SpecError, did_you_mean
+    from hoigs.core.registry.settings import describe_settings
+    from hoigs.core.spec.schema import KINDS, EntitySpec, Spec
+
+    rows = [asdict(row) for row in describe_settings(Spec)]
+    for kind in KINDS:
+        rows += [asdict(row) for row in describe_settings(EntitySpec, f"model.{kind}.")]
+    found = [r for r in rows if not under or f"{r['name']}.".startswith(f"{under}.")]
+    if not found:
+        names = [r["name"] for r in rows]
+        blocks = {n[:i] for n in names for i, c in enumerate(n) if c == "."}
+        raise SpecError(f'no key "{under}"{did_you_mean(under, [*names, *blocks])}')
+    typer.echo(json.dumps({"keys": found}, indent=1) if as_json else
+               "\n".join(settings_lines(found)))  # fmt: skip
 
 
 def _load(spec: str, settings: Sequence[str] | None, plugin: Sequence[Path] | None) -> Spec:

@@ -21,14 +21,14 @@ from hoigs.evaluation.scores import PartSize, Timing
 
 
 def model_size(model: SceneModel) -> list[PartSize]:
-    """The size of each entity, and of the interaction module if there is one."""
+    """The size of each entity, and of the interaction module and the decoder if there are any."""
     parts = []
     for name in model.entities:
         entity = model.entity(name)
         parts.append(PartSize(name, entity.kind, len(entity), *_stored(entity)))
-    if model.interaction is not None:
-        kind = type(model.interaction).__name__
-        parts.append(PartSize(kind, "interaction", 0, *_stored(model.interaction)))
+    for kind, module in (("interaction", model.interaction), ("decoder", model.decoder)):
+        if module is not None:
+            parts.append(PartSize(type(module).__name__, kind, 0, *_stored(module)))
     return parts
 
 
@@ -71,7 +71,7 @@ def render_time(
         start = _now(device)
         gaussians = model(moment).joined()
         middle = _now(device)
-        output = model.draw(gaussians, camera, RenderRequest())
+        output = model.draw(gaussians, camera, RenderRequest(), moment)
         end = _now(device)
         if step < warmup and not late:
             warmed += 1

@@ -98,7 +98,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class PartSize:
-    """Size of an entity or of the interaction module; megabytes are 10^6 bytes of its tensors."""
+    """Size of an entity, interaction or decoder; megabytes are 10^6 bytes of its tensors."""
 
     name: str
     kind: str
@@ -244,7 +244,13 @@ def size_table(parts: Sequence[PartSize]) -> Table:
     _, _, gaussians, parameters, megabytes = (list(c) for c in columns)
     rows.append(("total", "", sum(gaussians), sum(parameters), sum(megabytes)))
     cells = [
-        (name, kind, f"{count:,}" if kind != "interaction" else "–", f"{numbers:,}", f"{mb:.2f}")
+        (
+            name,
+            kind,
+            "–" if kind in ("interaction", "decoder") else f"{count:,}",
+            f"{numbers:,}",
+            f"{mb:.2f}",
+        )
         for name, kind, count, numbers, mb in rows
     ]
     columns_ = ("part", "kind", "Gaussians", "parameters", "MB")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -25,8 +25,8 @@ from hoigs.core.interfaces.deformation import (
 )
 from hoigs.core.maths.rotations import quats_to_matrices
 from hoigs.core.model.entity import Entity
-from hoigs.core.spec.train_schema import RatesSpec
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.spec.train_schema import rate_names
+from hoigs.core.values.gaussians import FIELDS, Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind, Residual
 from hoigs.core.values.topology import AxisChange, TopologyChange
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from hoigs.testing.runner import Options
 
 
-RAW = tuple(f.name for f in fields(Gaussians))
+RAW = FIELDS
 COUNT = 7
 INSIDE = (0.0, 0.13, 0.5, 0.77, 1.0)  # times of the clip: first and last frame, and between frames
 OUTSIDE = (-0.6, -0.01, 1.01, 1.6)
@@ -168,7 +168,7 @@ def subject(cls: type[DeformationModel], config: Any, options: Options) -> Defor
 
 
 def by_name(gaussians: Gaussians) -> dict[str, Tensor]:
-    return {name: getattr(gaussians, name) for name in RAW}
+    return gaussians.tensors()
 
 
 def require_same(what: str, got: Gaussians, expected: Gaussians, atol: float = 2e-5) -> None:
@@ -341,17 +341,17 @@ def values_are_finite_at_every_stage(subject: DeformationSubject) -> None:
         entity.deformation.set_progress(progress)
         for time in INSIDE:
             output = subject.draw(entity, time)
-            for name in RAW:
-                require_finite(f"{name} at {time}, {progress:.0%} done", getattr(output, name))
+            for name, value in by_name(output).items():
+                require_finite(f"{name} at {time}, {progress:.0%} done", value)
             require_finite_gradients(entity, weighted_sum(by_name(output)))
 
 
 @CHECKS.check("D31")
 def rates_exist_in_the_spec(subject: DeformationSubject) -> None:
     """Learning rates have names that a spec's train.rates has."""
-    known = set(RatesSpec.model_fields)
+    known = rate_names()
     for prefix, rate in subject.cls.rates.items():
-        require(rate in known, f'rates["{prefix}"] is "{rate}"; train.rates has {sorted(known)}')
+        require(rate in known, f'rates["{prefix}"] is "{rate}"; train.rates has {known}')
 
 
 @CHECKS.check("D33", has_parameters)
@@ -398,8 +398,9 @@ def shapes_for_any_number(subject: DeformationSubject) -> None:
     for count in (0, 1, 7):
         entity = subject.entity(count)
         output = subject.draw(entity, 0.4)
+        shapes = {name: x.shape for name, x in entity.canonical.tensors().items()}
         for name, x in by_name(output).items():
-            expected = getattr(entity.canonical, name).shape
+            expected = shapes.get(name, (count, x.shape[-1]))  # channels: any number
             require(
                 x.shape == expected,
                 f"with {count} Gaussians, {name} is {list(x.shape)}, expected {list(expected)}",
@@ -424,8 +425,8 @@ def values_are_finite(subject: DeformationSubject) -> None:
         entity = subject.entity(perturbed=perturbed)
         for time in (*INSIDE, *OUTSIDE):
             output = subject.draw(entity, time)
-            for name in RAW:
-                require_finite(f"{name} at {time}", getattr(output, name))
+            for name, value in by_name(output).items():
+                require_finite(f"{name} at {time}", value)
             require_finite_gradients(entity, weighted_sum(by_name(output)))
 
 

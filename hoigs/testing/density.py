@@ -288,7 +288,7 @@ def no_state_between_steps(subject: DensitySubject) -> None:
 def inputs_are_not_modified(subject: DensitySubject) -> None:
     """Gaussians and statistics are not written to."""
     control, canonical, seen = subject.control(), subject.cloud(), subject.statistics()
-    inputs = {f"canonical.{n}": x for n, x in vars(canonical).items()}
+    inputs = {f"canonical.{n}": x for n, x in canonical.tensors().items()}
     inputs |= {f"statistics.{n}": x for n, x in vars(seen).items()}
     with unchanged("", inputs):
         for step in range(1, TOTAL + 1):

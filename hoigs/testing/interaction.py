@@ -43,9 +43,10 @@ KINDS: dict[str, EntityKind] = {
     "ann": "human", "bob": "human", "cup": "object", "box": "object", "scene": "scene",
 }  # fmt: skip
 WIDTHS = {"ann": 6, "bob": 6, "cup": 4, "box": 4}
-COUNTS = {"ann": len(PART_NAMES), "bob": len(PART_NAMES), "cup": 5, "box": 3}
+COUNTS = {"ann": len(PART_NAMES), "bob": len(PART_NAMES), "cup": 5, "box": 3}  # tokens
 PLACES = {"ann": -0.3, "bob": 0.3, "cup": 0.0, "box": 0.1}  # along x, metres: all within reach
 FAR = 1e3
+MORE = 2
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,10 @@ class Inputs:
         tokens = {n: self.tokens[n] for n in names}
         return Inputs(tokens, {n: self.roles[n] for n in (*names, "scene")})
 
-    def with_tokens(self, name: str, tokens: Tokens) -> Inputs:
-        return replace(self, tokens={**self.tokens, name: tokens})
+    def with_tokens(self, name: str, tokens: Tokens, more: int = 0) -> Inputs:
+        """`more`: Gaussians of this entity beyond one for each token."""
+        role = replace(self.roles[name], gaussians=len(tokens.positions) + more)
+        return Inputs({**self.tokens, name: tokens}, {**self.roles, name: role})
 
     def shifted(self, *names: str, by: tuple[float, float, float]) -> Inputs:
         """These entities translated, with their anchors."""
@@ -93,6 +96,10 @@ class InteractionSubject(ModuleSubject[InteractionModule]):
             perturb(module, size=0.2)
         return module.to(device=self.device, dtype=dtype).eval()
 
+    def more(self, kind: EntityKind) -> int:
+        """Gaussians of an entity beyond its tokens: MORE, unless a token for each is needed."""
+        return 0 if self.cls.tokens.get(kind) == "gaussian" else MORE
+
     def inputs(self, dtype: torch.dtype = torch.float32) -> Inputs:
         """Two humans and two objects, all in reach of each other."""
         generator = torch.Generator().manual_seed(31)
@@ -108,7 +115,7 @@ class InteractionSubject(ModuleSubject[InteractionModule]):
             anchors = reach = None
             if KINDS[name] == "human":
                 anchors, reach = place[[0, 8, 9, 14, 15]], torch.tensor(0.7).to(place)
-            roles[name] = Role(KINDS[name], anchors, reach)
+            roles[name] = Role(KINDS[name], anchors, reach, count + self.more(KINDS[name]))
         return Inputs(tokens, roles)
 
     def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> InteractionModule:
@@ -161,18 +168,21 @@ def learns(subject: InteractionSubject) -> str | None:
 
 @CHECKS.check("I01")
 def residuals_fit_their_entities(subject: InteractionSubject) -> None:
-    """Residuals are of entities with tokens: poses [51, 3] of humans, a mean for each token."""
-    residuals = subject.run(subject.module(), subject.inputs())
+    """Residuals are of entities with tokens: poses [51, 3] of humans, a mean for each Gaussian."""
+    inputs = subject.inputs()
+    residuals = subject.run(subject.module(), inputs)
     for name, residual in residuals.items():
         require(name in COUNTS, f'"{name}" has no tokens but gets a residual')
         if residual.pose is not None:
             require(KINDS[name] == "human", f'"{name}" is not a human but gets a pose correction')
             require(residual.pose.shape == (51, 3), f"{name}.pose is {list(residual.pose.shape)}")
         if residual.means is not None:
-            shape = list(residual.means.shape)
+            shape, count = list(residual.means.shape), inputs.roles[name].gaussians
             require(
-                shape == [COUNTS[name], 3],
-                f"{name}.means is {shape}: expected one for each token, [M, 3]",
+                shape == [count, 3],
+                f"{name}.means is {shape}: expected one for each Gaussian, [{count}, 3], of which "
+                f"it has {COUNTS[name]} tokens; where one for each is needed, declare it: "
+                f'tokens = {{"{KINDS[name]}": "gaussian"}}',
             )
 
 
@@ -244,14 +254,15 @@ def order_of_entities_does_not_matter(subject: InteractionSubject) -> None:
 
 @CHECKS.check("I07")
 def order_of_an_objects_tokens_does_not_matter(subject: InteractionSubject) -> None:
-    """Permuted tokens of an object have permuted residuals, and all others the same."""
+    """Permuted tokens of an object have permuted residuals, one each, and all others the same."""
     module, whole = subject.module(), subject.inputs()
     order, cup = [3, 0, 4, 2, 1], whole.tokens["cup"]
     turned = Tokens(cup.features[order], cup.positions[order])
     expected = corrections(subject.run(module, whole))
-    if "cup.means" in expected:
+    more = subject.more("object")
+    if "cup.means" in expected and not more:
         expected["cup.means"] = expected["cup.means"][order]
-    got = corrections(subject.run(module, whole.with_tokens("cup", turned)))
+    got = corrections(subject.run(module, whole.with_tokens("cup", turned, more)))
     for name, x in expected.items():
         require_close(f"{name}, with permuted tokens", got[name], x, atol=1e-5)
 
@@ -260,9 +271,9 @@ def order_of_an_objects_tokens_does_not_matter(subject: InteractionSubject) -> N
 def every_combination_works(subject: InteractionSubject) -> None:
     """No entity, humans only, objects only, one of each, and objects of one or no token work."""
     module, whole = subject.module(), subject.inputs()
-    cup = whole.tokens["cup"]
-    one = whole.with_tokens("cup", Tokens(cup.features[:1], cup.positions[:1]))
-    none = whole.with_tokens("cup", Tokens(cup.features[:0], cup.positions[:0]))
+    cup, more = whole.tokens["cup"], subject.more("object")
+    one = whole.with_tokens("cup", Tokens(cup.features[:1], cup.positions[:1]), more)
+    none = whole.with_tokens("cup", Tokens(cup.features[:0], cup.positions[:0]), more)
     combinations = {
         "no entity": whole.only(),
         "humans only": whole.only("ann", "bob"),

@@ -27,6 +27,7 @@ KINDS = {
     "rasterizer": "hoigs.testing.rasterizer",
     "exporter": "hoigs.testing.exporter",
     "objective": "hoigs.testing.objective",
+    "decoder": "hoigs.testing.decoder",
 }
 PLUGIN = "hoigs.testing.plugin"
 

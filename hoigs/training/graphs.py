@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -232,7 +232,6 @@ class GraphKey:
 
 
 Mode = Literal["graph", "cached", "plain"]
-FIELDS = tuple(f.name for f in fields(Gaussians))
 # Largest relative L2 difference of a tensor between a graph and eager execution. Sums in another
 # order differed by 6e-4 in tokens of a recorded clip; what a graph reads from memory that is not
 # its own any more is another picture.
@@ -452,9 +451,9 @@ class _ModelStep(nn.Module):
     def forward(self, moment: Moment) -> dict[Key, Tensor]:
         state: SceneState = self.scene(moment)
         joined = state.joined()
-        found: dict[Key, Tensor] = {("joined", f): getattr(joined, f) for f in FIELDS}
+        found: dict[Key, Tensor] = {("joined", f): x for f, x in joined.tensors().items()}
         for name, gaussians in state.gaussians.items():
-            found |= {("gaussians", name, f): getattr(gaussians, f) for f in FIELDS}
+            found |= {("gaussians", name, f): x for f, x in gaussians.tensors().items()}
         for name, tokens in state.tokens.items():
             found["tokens", name, "features"] = tokens.features.detach()
             found["tokens", name, "positions"] = tokens.positions.detach()

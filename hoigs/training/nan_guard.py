@@ -29,9 +29,9 @@ def first_not_finite(
         if not torch.isfinite(parameter).all():
             return f"parameter {name}"
     for entity, values in gaussians.items():
-        for f in fields(values):
-            if not torch.isfinite(getattr(values, f.name)).all():
-                return f"{f.name} of the deformed Gaussians of {entity!r}"
+        for field, value in values.tensors().items():
+            if not torch.isfinite(value).all():
+                return f"{field} of the deformed Gaussians of {entity!r}"
     for name, loss in losses.items():
         if not torch.isfinite(loss).all():
             return f"loss term {name!r}"

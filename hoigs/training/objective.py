@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -156,6 +156,8 @@ class JointObjective:
         """
         frame, device = view.frame, camera.K.device
         state = self._settled(deformed.state) if self.settled else deformed.state
+        if self.model.decoder is not None and state.moment is None:  # from a CUDA graph
+            state = replace(state, moment=frame.moment.to(device))
         offsets = torch.zeros(
             sum(len(g) for g in state.gaussians.values()), 2, device=device, requires_grad=True
         )
@@ -173,7 +175,8 @@ class JointObjective:
         )
         trained = [n for n in self.model.entities if not self.settled or self._is_scene(n)]
         own: dict[str, Callable[[], Part]] = {
-            n: partial(self._of_entity, n, view, camera, deformed, backgrounds) for n in trained
+            n: partial(self._of_entity, n, view, camera, state, deformed.penalties, backgrounds)
+            for n in trained
         }
         own["composite"] = partial(self._of_composite, view, camera, state, request)
         found = apart(own, (state, camera, view, backgrounds, request))
@@ -217,7 +220,7 @@ class JointObjective:
         """The render of all entities, and its terms."""
         frame, offsets = view.frame, request.screen_offsets
         assert offsets is not None
-        composite = self.model.draw(state.joined(), camera, request)
+        composite = self.model.draw(state.joined(), camera, request, state.moment)
         terms = self._composite(view, composite)
         terms |= self._scene_alone(
             frame, camera, state, composite, offsets, request.absolute_gradients
@@ -238,17 +241,18 @@ class JointObjective:
         name: str,
         view: TrainingView,
         camera: Camera,
-        deformed: Deformed,
+        state: SceneState,
+        penalties: Mapping[str, Mapping[str, Tensor]] | None,
         backgrounds: Mapping[str, Float[Tensor, "3"]],
     ) -> Part:
         """The terms of an entity alone: of its render, and penalties."""
         terms: dict[str, Tensor] = {}
         kind, crop = self.model.entity(name).kind, view.crops.get(name)
         if crop is not None and name in backgrounds:
-            terms = self._alone(name, kind, crop, camera, deformed.state, backgrounds[name])
+            terms = self._alone(name, kind, crop, camera, state, backgrounds[name])
         weights = {name: self._weight_of_kind(name) for name in terms}
-        own = None if deformed.penalties is None else deformed.penalties[name]
-        self._regularize(name, deformed.state.gaussians[name], own, terms, weights)
+        own = None if penalties is None else penalties[name]
+        self._regularize(name, state.gaussians[name], own, terms, weights)
         return None, terms, weights
 
     def _weight_of_kind(self, term: str) -> float:
@@ -261,7 +265,7 @@ class JointObjective:
         """Without gradients but of scenes."""
         scenes = self.model.names("scene")
         kept = {n: g if n in scenes else g.detach() for n, g in state.gaussians.items()}
-        return SceneState(kept, state.residuals, state.tokens)
+        return replace(state, gaussians=kept, whole=None)
 
     def _deform(self, moment: Moment) -> Deformed:
         """A method of its own, so that benchmarks can time it."""
@@ -340,7 +344,7 @@ class JointObjective:
                 screen_offsets=_of(scenes, state, offsets),
                 absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
             )
-        return self.model.draw(state.joined(scenes), camera, request)
+        return self.model.draw(state.joined(scenes), camera, request, state.moment)
 
     def _alone(
         self,
@@ -358,7 +362,10 @@ class JointObjective:
         # without waiting for what the device is doing: CUDA has read the colour at the return
         background = background.to(camera.K, non_blocking=True)
         output = self.model.draw(
-            state.gaussians[name], crop.seen_from(camera), RenderRequest(background=background)
+            state.gaussians[name],
+            crop.seen_from(camera),
+            RenderRequest(background=background),
+            state.moment,
         )
         compared = Comparison(
             crop.pixels, crop.mask, crop.ignore, background, area=crop.area, box=crop.box

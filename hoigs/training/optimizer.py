@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, get_args
@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
-from hoigs.core.errors import SpecError, did_you_mean
+from hoigs.core.errors import PluginError, SpecError, did_you_mean
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec
+from hoigs.core.spec.train_schema import RatesSpec, WarmupSpec, rate_names
 from hoigs.core.values.tokens import EntityKind
 from hoigs.core.values.topology import AxisChange, TopologyChange
 
@@ -79,6 +79,12 @@ def trained_throughout(name: str, entity: Entity | None) -> bool:
     return name.startswith("cameras.") or (entity is not None and entity.kind == "scene")
 
 
+def rate_of(parameter: str, rates: Mapping[str, str]) -> str:
+    """The rate of a module's parameter, by the longest prefix that the module declares."""
+    prefixes = [prefix for prefix in rates if parameter.startswith(prefix)]
+    return rates[max(prefixes, key=len)] if prefixes else "networks"
+
+
 def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Entity | None]]:
     """Every trainable parameter with its dotted name, its rate's name and its entity."""
     for name in model.entities:
@@ -86,17 +92,13 @@ def named_rates(model: SceneModel) -> Iterator[tuple[str, nn.Parameter, str, Ent
         for path, parameter in entity.named_parameters():
             head, _, tail = path.partition(".")
             module = getattr(entity, head) if tail else None
-            if module is None:
-                rate = FIELD_RATES[path]
-            else:
-                prefixes = [p for p in module.rates if tail.startswith(p)]
-                rate = module.rates[max(prefixes, key=len)] if prefixes else "networks"
+            rate = FIELD_RATES[path] if module is None else rate_of(tail, module.rates)
             if parameter.requires_grad:
                 yield f"entities.{name}.{path}", parameter, rate, entity
-    if model.interaction is not None:
-        for path, parameter in model.interaction.named_parameters():
+    for head, module in (("interaction", model.interaction), ("decoder", model.decoder)):
+        for path, parameter in () if module is None else module.named_parameters():
             if parameter.requires_grad:
-                yield f"interaction.{path}", parameter, "networks", None
+                yield f"{head}.{path}", parameter, rate_of(path, getattr(module, "rates", {})), None
 
 
 class GroupedAdam:
@@ -111,7 +113,7 @@ class GroupedAdam:
         steps: of the training. settled: after which people, objects and the interaction are done.
 
     Raises:
-        ValueError: a component declares a rate that `train.rates` does not have.
+        PluginError: a component declares a rate that `train.rates` does not have.
         SpecError: `rates.by_entity` names an entity that the model does not have.
     """
 
@@ -142,8 +144,10 @@ class GroupedAdam:
             own = rates if entity is None else rates.of(name.split(".")[1], entity.kind)
             start = getattr(own, rate, None)
             if start is None:
-                known = sorted(RatesSpec.model_fields)
-                raise ValueError(f"{name} declares the rate {rate!r}; train.rates has {known}")
+                rates_known = ", ".join(rate_names())
+                raise PluginError(
+                    f"{name} declares the rate {rate!r}; train.rates has {rates_known}"
+                )
             final = getattr(own, f"{rate}_final", None)
             settles = final is None and own.settle < 1
             if final is None:

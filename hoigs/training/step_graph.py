@@ -208,7 +208,8 @@ def why_not_whole(objective: JointObjective) -> str | None:
     ):
         if present:
             return f"{name} is not part of graphs of whole steps"
-    components = components_of(objective.model) | {"rasterizer": objective.model.rasterizer}
+    model = objective.model
+    components = components_of(model) | {"rasterizer": model.rasterizer, "decoder": model.decoder}
     for name, control in objective.density.items():
         if type(control).regularizers is not DensityControl.regularizers:
             components[f"{name}.density"] = control

@@ -23,16 +23,15 @@ from torch.nn.functional import normalize
 
 from hoigs.core.interfaces.body import HEAD_PART
 from hoigs.core.interfaces.deformation import ProvidesTemplate, Template
-from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.nearest import nearest
 from hoigs.core.maths.projection import project
 from hoigs.core.maths.spherical_harmonics import mean_colors
-from hoigs.core.model.entity import FIELDS, Entity
+from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import TrainSpec
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
-from hoigs.core.values.gaussians import SH_C0, Gaussians
+from hoigs.core.values.gaussians import FIELDS, SH_C0, Gaussians
 
 # Values of points that were seen, continued over those that were not.
 
@@ -309,7 +308,7 @@ def blending_weights(model: SceneModel, drawn: Gaussians, camera: Camera) -> Flo
     """
     sh = torch.zeros(len(drawn), 1, 3, device=model.device, requires_grad=True)
     with torch.enable_grad():
-        color = model.draw(drawn.replace(sh=sh), camera, RenderRequest()).color
+        color = model.rasterize(drawn.replace(sh=sh), camera).color
         (gradient,) = torch.autograd.grad(color[..., 0].sum(), sh)
     return gradient[:, 0, 0] / SH_C0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -195,11 +195,11 @@ class Playback:
         """How the Gaussians differ from the plain ones; None if they agree."""
         for moment, camera, plain in references:
             self(moment, camera)
-            for f in fields(Gaussians):
-                ours, theirs = getattr(self._joined, f.name), getattr(plain, f.name)
+            for field, theirs in plain.tensors().items():
+                ours = self._joined.tensors()[field]
                 worst = float((ours - theirs).abs().max()) if len(plain) else 0.0
                 if not worst <= TOLERANCE * max(1.0, float(theirs.abs().max())):
-                    return f"{f.name} differ by {worst:.3g} from the plain path's"
+                    return f"{field} differ by {worst:.3g} from the plain path's"
         return None
 
     def _hold(self, moment: Moment) -> None:
@@ -255,9 +255,9 @@ class Playback:
         state = self._model(self._moment(), self._names)
         for name, rows in self._rows.items():
             moved = state.gaussians[name]
-            for f in fields(Gaussians):
-                into, value = getattr(self._joined, f.name)[rows], getattr(moved, f.name)
-                if f.name == "sh":  # higher bands, of other entities, are zero from the start
+            for field, value in moved.tensors().items():
+                into = self._joined.tensors()[field][rows]
+                if field == "sh":  # higher bands, of other entities, are zero from the start
                     into = into[:, : value.shape[1]]
                 into.copy_(value)
 
@@ -269,7 +269,8 @@ class Playback:
             self._packed[:16].to(kind, copy=True).view(4, 4),
             *self._size,
         )
-        return self._model.draw(self._joined, camera, self._request)
+        moment = None if self._model.decoder is None else self._moment()
+        return self._model.draw(self._joined, camera, self._request, moment)
 
     def _capture(self) -> None:
         """Capture one graph of `_deform` and one of `_draw`."""

@@ -1,11 +1,14 @@
-"""`hoigs spec list|check|show`."""
+"""`hoigs spec list|check|show|keys`."""
 
 from __future__ import annotations
+
+import json
 
 import pytest
 
 from hoigs.core.spec.files import builtin_specs
 from hoigs.core.spec.schema import Spec
+from hoigs.core.spec.train_schema import rate_names
 
 
 def test_list(hoigs):
@@ -79,3 +82,15 @@ def test_profiles(hoigs, tmp_path):
     copy = tmp_path / "copy.yaml"
     copy.write_text(hoigs("spec", "show", "hoigs@matched").out)
     assert hoigs("spec", "check", copy).out.startswith("hoigs@matched: ok\n")
+
+
+def test_keys(hoigs):
+    listed = hoigs("spec", "keys").out
+    assert "\ntrain.steps: int >= 1; default 2000\n    Optimizer steps" in listed
+    assert "\nmodel.human.points: int >= 1; default 10000\n" in listed
+    rates = hoigs("spec", "keys", "train.rates").out.splitlines()
+    assert rates[0].startswith("train.rates.means: float")
+    found = json.loads(hoigs("spec", "keys", "train.rates", "--json").out)["keys"]
+    assert {f"train.rates.{rate}" for rate in rate_names()} < {key["name"] for key in found}
+    outcome = hoigs("spec", "keys", "train.rate")
+    assert outcome.code == 2 and 'did you mean "train.rates"?' in outcome.err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import ClassVar
 
 import torch
 from torch import nn
@@ -22,6 +23,8 @@ class RightConfig(ComponentConfig):
 
 class Right(InteractionModule):
     """Correct: sums over pairs, weighted by how far the object's centre is within reach."""
+
+    tokens: ClassVar = {"object": "gaussian"}
 
     def __init__(self) -> None:
         super().__init__()
@@ -167,6 +170,12 @@ class SpoilsTheFoot(Right):
             if role.anchors is not None:
                 role.anchors[4] = 0.0
         return found
+
+
+class OneForEachToken(Right):
+    """Does not say that an object needs a token for each Gaussian."""
+
+    tokens: ClassVar = {}
 
 
 MUTANTS = {

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.gaussians import FIELDS, Gaussians
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.testing.rasterizer.subject import forged
 
-RAW = tuple(f.name for f in fields(Gaussians))
+RAW = FIELDS
 ASKED = ("features", "screen_offsets", "background", "absolute_gradients")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import body_mutants
+import decoder_mutants
 import density_mutants
 import exporter_mutants
 import features_mutants
@@ -14,7 +15,16 @@ import pytest
 import reader_mutants
 
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.testing import body, density, exporter, features, interaction, objective, reader
+from hoigs.testing import (
+    body,
+    decoder,
+    density,
+    exporter,
+    features,
+    interaction,
+    objective,
+    reader,
+)
 from hoigs.testing.checks import run_checks
 from hoigs.testing.material import TinyBody
 
@@ -23,6 +33,10 @@ KINDS: dict[str, tuple[Any, ...]] = {
     "density": (
         density.CHECKS, density.DensitySubject, density_mutants.MUTANTS,
         density_mutants.RightDensity, density_mutants.RightDensityConfig(),
+    ),
+    "decoder": (
+        decoder.CHECKS, decoder.DecoderSubject, decoder_mutants.MUTANTS,
+        decoder_mutants.Right, decoder_mutants.RightConfig(),
     ),
     "body": (
         body.CHECKS, body.BodySubject, body_mutants.MUTANTS, TinyBody, body_mutants.TinyConfig(),
@@ -63,3 +77,13 @@ def test_the_right_one_passes_and_every_check_has_a_mutant(kind) -> None:
 def test_a_check_kills_its_mutant_alone(kind, id, kill) -> None:
     checks, subject, mutants, _, config = KINDS[kind]
     kill(checks, subject(mutants[id], config), id, mutants[id].__name__)
+
+
+def test_tokens_that_an_interaction_needs_are_declared() -> None:
+    """One that gives a residual for each token, and does not say that it needs one for each."""
+    made = interaction.InteractionSubject(
+        interaction_mutants.OneForEachToken, interaction_mutants.RightConfig()
+    )
+    (failed,) = [r for r in run_checks(interaction.CHECKS, made).results if r.id == "I01"]
+    assert "[5, 3]" in failed.why and "[7, 3]" in failed.why, failed.why
+    assert 'tokens = {"object": "gaussian"}' in failed.why

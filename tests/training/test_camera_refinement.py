@@ -89,7 +89,7 @@ def test_a_correction_is_exactly_the_motion_that_it_says() -> None:
 def gradients(rasterizer: Rasterizer, dtype: torch.dtype, step: float | None) -> Tensor:
     """Of a loss by one camera's correction [6]; by central differences if there is a `step`."""
     clip, scene = small_clip(), truth()
-    drawn = Gaussians(*(x.to(dtype) for x in vars(scene).values()))
+    drawn = Gaussians(*(x.to(dtype) for x in scene.tensors().values()))
     weights = torch.randn(64, 64, 3, generator=torch.Generator().manual_seed(4)).to(dtype)
     refinement = CameraRefinement.of(clip).to(dtype)
     with torch.no_grad():

@@ -111,7 +111,7 @@ def test_every_row_of_a_time_plane_is_read():  # F10
     for time in torch.linspace(0, 1, 2 * rows + 1).tolist():
         model.zero_grad(set_to_none=True)
         state = model(at(clip, time)).joined()
-        sum(value.sin().sum() for value in vars(state).values()).backward()
+        sum(value.sin().sum() for value in state.tensors().values()).backward()
         for path, parameter in planes.items():
             if parameter.grad is not None:
                 read[path] |= parameter.grad.abs().sum((0, 2, 3)) > 0

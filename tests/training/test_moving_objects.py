@@ -62,7 +62,7 @@ def prepared(spec: Spec, clip: Clip, thing: Thing) -> tuple[SceneModel, Trainer]
     """The model with the right shapes and colours: only the motion is to be found."""
     model = compose(spec, clip)
     for name, shape in (("object", thing.shape), ("scene", backdrop())):
-        for field, value in vars(shape).items():
+        for field, value in shape.tensors().items():
             getattr(model.entity(name), field).data.copy_(value)
     return model, Trainer(model, clip, spec.train, density=compose_density(spec, clip))
 

@@ -52,11 +52,15 @@ def compose(spec: Spec, clip: Clip, registry: Registry | None = None) -> SceneMo
             for name, kind, place, block in builder.chosen()
         }
         interaction = builder.part(("interaction",), spec.interaction, context)
+        decoder = None
+        if spec.decoder is not None:
+            decoder = builder.part(("decoder",), spec.decoder, context)
         with _errors_at(spec, "interaction"):
             model = SceneModel(
                 entities,
                 interaction=interaction,
                 rasterizer=rasterizer,
+                decoder=decoder,
                 low_pass=spec.low_pass,
                 antialiased=spec.antialiased,
             )

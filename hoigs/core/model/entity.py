@@ -18,12 +18,10 @@ from hoigs.core.interfaces.body import PART_NAMES
 from hoigs.core.interfaces.deformation import DeformationModel, ProvidesSkeleton
 from hoigs.core.interfaces.features import FeatureExtractor, check_provided
 from hoigs.core.interfaces.interaction import InteractionModule
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.gaussians import FIELDS, Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import POSE_JOINTS, EntityKind, Residual, Role, Tokens
 from hoigs.core.values.topology import TopologyChange, share_opacity
-
-FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 
 
 class Entity(nn.Module):
@@ -103,10 +101,12 @@ class Entity(nn.Module):
         return self.features(self.deformation, self.canonical, moment)
 
     def role(self, moment: Moment) -> Role:
-        """The entity's kind and, of a human with a skeleton, where its reach begins and ends."""
+        """The entity's kind and number of Gaussians and, of a human with a skeleton, where its
+        reach begins and ends."""
         if self.kind == "human" and isinstance(self.deformation, ProvidesSkeleton):
-            return Role("human", self.deformation.anchors(moment), self.deformation.arm_length())
-        return Role(self.kind)
+            anchors, reach = self.deformation.anchors(moment), self.deformation.arm_length()
+            return Role("human", anchors, reach, len(self))
+        return Role(self.kind, gaussians=len(self))
 
     def forward(self, moment: Moment, residual: Residual | None = None) -> Gaussians:
         """The entity at `moment`: raw Gaussians in the world."""

@@ -17,6 +17,7 @@ import torch
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.interfaces.configurable import Configurable
+from hoigs.core.model.entity import name_of
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.values.clip import Clip
@@ -155,8 +156,17 @@ class Exporter(Configurable, ABC):
         """Write the folder `out`. When this raises, `out` is absent, as it was.
 
         Raises:
-            HoigsError: `out` exists, `write` left no file in it, or as `write`.
+            HoigsError: `out` exists, a decoder makes the scene's pictures, which the colours of the
+                Gaussians are not, `write` left no file in it, or as `write`.
         """
+        decoder = request.scene.decoder
+        if decoder is not None and self.reads_gaussians:
+            raise HoigsError(
+                f"{type(self).__name__} writes Gaussians or surfaces with colours, and a decoder, "
+                f"{name_of(decoder)}, makes the pictures of this scene: in another program they "
+                "would look otherwise. `hoigs render` and `hoigs view` use the decoder; formats of "
+                "a skeleton alone, such as bvh, can be exported"
+            )
         if out.exists() or out.is_symlink():
             raise HoigsError(f"{out} exists and is not replaced; name another folder to write")
         omitted = self._unsuited(request)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from hoigs.core.errors import HoigsError, require_type
+from hoigs.core.errors import HoigsError, PluginError, require_type
 from hoigs.core.fast.streams import apart
+from hoigs.core.interfaces.decoder import Decoder
 from hoigs.core.interfaces.features import FeatureExtractor
-from hoigs.core.interfaces.interaction import InteractionModule
+from hoigs.core.interfaces.interaction import InteractionModule, check_tokens
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
-from hoigs.core.model.entity import Entity, call, require_residuals, require_tokens
+from hoigs.core.model.entity import Entity, call, name_of, require_residuals, require_tokens
 from hoigs.core.system.files import require_entity_name
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
@@ -30,12 +31,14 @@ class SceneState:
     Attributes:
         gaussians: raw, world. residuals, tokens: empty where the interaction did not run.
         whole: all of `gaussians` in one, if it has been computed already.
+        moment: on the model's device; None where it is not known there.
     """
 
     gaussians: Mapping[str, Gaussians]
     residuals: Mapping[str, Residual]
     tokens: Mapping[str, Tokens]
     whole: Gaussians | None = None
+    moment: Moment | None = None
 
     def joined(self, only: Iterable[str] | None = None) -> Gaussians:
         """The Gaussians of all entities, or of those in `only`, in the scene's order."""
@@ -58,12 +61,14 @@ class SceneState:
 class SceneModel(nn.Module):
     """Entities, the interaction between them, and the rasterizer that draws them.
 
-    moment -> features -> interaction -> deformation -> Gaussians(t) -> rasterizer -> image
+    moment -> features -> interaction -> deformation -> Gaussians(t) -> rasterizer [-> decoder]
+    -> image
 
     Args:
         entities: by name; their order decides that of the joined Gaussians.
         interaction: couples the entities that have features; None couples nothing.
         rasterizer: any backend; `model.rasterizer` may be replaced at any time.
+        decoder: makes the picture from what was drawn; None takes the colours as they are drawn.
         low_pass: variance added to the screen covariance, square pixels, wherever the model is
             drawn: it learns its Gaussians with one value, and looks too thin or too soft with
             another. antialiased: likewise, whether opacities make up for it (`RenderRequest`).
@@ -72,7 +77,8 @@ class SceneModel(nn.Module):
         interaction_enabled: False during the warm-up of the interaction.
 
     Raises:
-        ValueError: there are no entities, or one has a name that none can have.
+        ValueError: there are no entities, one has a name that none can have, or its features
+            declare other tokens than the interaction needs.
         TypeError: an argument is of another type.
         HoigsError: parameters of several dtypes, or of float32 where torch's default is another.
     """
@@ -83,6 +89,7 @@ class SceneModel(nn.Module):
         *,
         interaction: InteractionModule | None = None,
         rasterizer: Rasterizer,
+        decoder: Decoder | None = None,
         low_pass: float = 0.3,
         antialiased: bool = False,
     ) -> None:
@@ -95,17 +102,22 @@ class SceneModel(nn.Module):
         require_type("SceneModel", "rasterizer", rasterizer, Rasterizer)
         if interaction is not None:
             require_type("SceneModel", "interaction", interaction, InteractionModule)
+        if decoder is not None:
+            require_type("SceneModel", "decoder", decoder, Decoder)
         self.entities = nn.ModuleDict(entities)
         self.interaction = interaction
         self.interaction_enabled = True
         self.rasterizer = rasterizer
+        self.decoder = decoder
         self.low_pass = low_pass
         self.antialiased = antialiased
         if interaction is not None:
-            described = {n: e for n, e in entities.items() if e.features is not None}
+            described = {n: e.features for n, e in entities.items() if e.features is not None}
+            for name, features in described.items():
+                check_tokens(interaction, features, entities[name].kind)
             interaction.bind(
-                {n: e.features.width for n, e in described.items() if e.features is not None},
-                {n: e.kind for n, e in entities.items()},
+                {name: features.width for name, features in described.items()},
+                {name: entity.kind for name, entity in entities.items()},
             )
         self._check_dtypes()
 
@@ -166,7 +178,8 @@ class SceneModel(nn.Module):
             residuals = call(module, "interaction", module, tokens, roles)
             require_residuals(module, residuals, tokens, extractors, self.count())
         moved = {name: partial(self._moved, name, moment, residuals.get(name)) for name in names}
-        return SceneState(apart(moved, (moment, residuals)), residuals, tokens)
+        gaussians = apart(moved, (moment, residuals))
+        return SceneState(gaussians, residuals, tokens, moment=moment)
 
     def _described(self, name: str, moment: Moment) -> tuple[Tokens | None, Role]:
         """What the interaction reads of an entity."""
@@ -175,8 +188,10 @@ class SceneModel(nn.Module):
         return tokens, entity.role(moment)
 
     def _moved(self, name: str, moment: Moment, residual: Residual | None) -> Gaussians:
-        entity = self.entity(name)
-        return call(entity.deformation, f"deformation of {name!r}", entity, moment, residual)
+        entity, role = self.entity(name), f"deformation of {name!r}"
+        found = call(entity.deformation, role, entity, moment, residual)
+        self._require_channels(role, entity.deformation, found)
+        return found
 
     def render(
         self,
@@ -203,17 +218,74 @@ class SceneModel(nn.Module):
         request = request or RenderRequest()
         if background is not None:
             request = request.replace(background=background)
-        return self.draw(state.joined(), camera, request)
+        return self.draw(state.joined(), camera, request, moment)
 
     def draw(
-        self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
+        self,
+        gaussians: Gaussians,
+        camera: Camera,
+        request: RenderRequest | None = None,
+        moment: Moment | None = None,
     ) -> RenderOutput:
-        """Draw Gaussians of this model, which `forward` or `SceneState` gives, as it is trained.
+        """The picture of Gaussians of this model, which `forward` or `SceneState` gives.
 
         Args:
             request: everything that a rasterizer can be requested to do, but for `low_pass` and
                 `antialiased`, which are the model's.
+            moment: of the Gaussians, on their device; a decoder needs it.
+
+        Raises:
+            HoigsError: the model has a decoder, and there is no moment.
+            PluginError: the decoder gives something else than a picture.
         """
+        decoder = self.decoder
+        if decoder is None:
+            return self.rasterize(gaussians, camera, request)
+        if moment is None:
+            raise HoigsError(
+                f"SceneModel.draw: the decoder of this model, {name_of(decoder)}, needs the "
+                "moment: draw(gaussians, camera, request, moment); `rasterize` draws without it"
+            )
+        request, channels = request or RenderRequest(), gaussians.channels
+        if channels is None:
+            channels = gaussians.means.new_zeros(len(gaussians), decoder.channels)
+        asked = gaussians.means.new_zeros(len(gaussians), 0)
+        if request.features is not None:
+            asked = request.features
+        both = torch.cat((asked, channels), 1)
+        drawn = self.rasterize(
+            gaussians, camera, request.replace(features=both if both.shape[1] else None)
+        )
+        further = own = None
+        if drawn.features is not None:
+            further, own = drawn.features.split((asked.shape[1], channels.shape[1]), -1)
+        drawn = replace(drawn, features=own if decoder.channels else None)
+        color = call(decoder, "decoder", decoder, drawn, camera, moment)
+        if color.shape != drawn.color.shape:
+            raise PluginError(
+                f"decoder: {name_of(decoder)} gave a picture {list(color.shape)}, expected "
+                f"{list(drawn.color.shape)}"
+            )
+        features = None if request.features is None else further
+        return replace(drawn, color=color, features=features)
+
+    def _require_channels(self, role: str, part: object, gaussians: Gaussians) -> None:
+        """Raise PluginError where channels are no row a Gaussian, or not those that are decoded."""
+        channels = gaussians.channels
+        if channels is None:
+            return
+        width = channels.shape[-1] if self.decoder is None else self.decoder.channels
+        if tuple(channels.shape) != (len(gaussians), width):
+            reads = "" if self.decoder is None else f", as {name_of(self.decoder)} reads {width}"
+            raise PluginError(
+                f"{role}: {name_of(part)} gave channels {list(channels.shape)}, expected "
+                f"[{len(gaussians)}, {width}]{reads}"
+            )
+
+    def rasterize(
+        self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
+    ) -> RenderOutput:
+        """Draw any Gaussians in their own colours, without the decoder; `request` as for `draw`."""
         request = (request or RenderRequest()).replace(
             low_pass=self.low_pass, antialiased=self.antialiased
         )
@@ -239,5 +311,7 @@ class SceneModel(nn.Module):
             rows.append((name, entity.kind, f"{len(entity):,}", f"{numbers:,}", *parts))
         interaction = "no" if self.interaction is None else type(self.interaction).__name__
         drawn = f"{type(self.rasterizer).__name__} on {self.device}, {interaction} interaction"
+        if self.decoder is not None:
+            drawn += f", decoded by {type(self.decoder).__name__}"
         columns = ("entity", "kind", "Gaussians", "parameters", "deformation", "features")
         return html_table(f"SceneModel: {drawn}", columns, rows)

@@ -22,6 +22,7 @@ INTERFACES: dict[str, str] = {
     "features": "hoigs.core.interfaces.features:FeatureExtractor",
     "interaction": "hoigs.core.interfaces.interaction:InteractionModule",
     "rasterizer": "hoigs.core.interfaces.rasterizer:Rasterizer",
+    "decoder": "hoigs.core.interfaces.decoder:Decoder",
     "body": "hoigs.core.interfaces.body:BodyModel",
     "reader": "hoigs.core.interfaces.reader:ClipReader",
     "density": "hoigs.core.interfaces.density:DensityControl",

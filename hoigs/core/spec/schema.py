@@ -22,7 +22,7 @@ from pydantic import (
     field_validator,
 )
 
-from hoigs.core.errors import PluginError, SpecError
+from hoigs.core.errors import PluginError, SpecError, did_you_mean
 from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.errors import explain
 from hoigs.core.spec.files import (
@@ -31,7 +31,7 @@ from hoigs.core.spec.files import (
     read_spec,
 )
 from hoigs.core.spec.loader import Document, Place, dump_yaml, load_overrides, load_yaml
-from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec
+from hoigs.core.spec.train_schema import EvaluationSpec, TrainSpec, rate_names
 from hoigs.core.system.files import NAME, RULE
 
 # Names that specs of version 0.1 used, read as the present ones.
@@ -73,7 +73,9 @@ def _block(block: Any) -> Any:
 
 
 # sections that decide which tensors a model has; a checkpoint belongs to these
-MODEL_SECTIONS = ("interaction", "entities", "model")
+MODEL_SECTIONS = ("interaction", "decoder", "entities", "model")
+# sections that older specs do not have: they enter a hash where they are not empty
+LATER = ("objectives", "decoder")
 # settings of an entity that decide no tensor's existence: how training changes the count, and where
 # opacities start. `points` is not among them: penalties between neighbours depend on first points.
 OF_AN_ENTITY = ("deformation", "features", "density", "body", "initializer")  # components
@@ -155,6 +157,8 @@ class Spec(_Strict):
     pictures larger or smaller than those of the training look alike. False is 3DGS."""
     interaction: ComponentSpec = ComponentSpec(use="interaction:none")
     """Couples the entities."""
+    decoder: ComponentSpec | None = None
+    """Makes the picture from what was drawn; None takes the colours as they are drawn."""
     entities: tuple[str, ...] | None = None
     """Names or kinds of the clip's entities to model; None models all. The others are ignored:
     their pixels count as scene."""
@@ -226,6 +230,8 @@ class Spec(_Strict):
         """Every component with its place in the tree."""
         yield ("rasterizer",), self.rasterizer
         yield ("interaction",), self.interaction
+        if self.decoder is not None:
+            yield ("decoder",), self.decoder
         for name, block in self.model.items():
             for field in OF_AN_ENTITY:
                 part = getattr(block, field)
@@ -248,7 +254,7 @@ class Spec(_Strict):
 
     def hash(self) -> str:
         """SHA-256 of what a result depends on: not names and summary, nor how it is computed."""
-        left_out = {"name", "summary"} | ({"objectives"} if not self.objectives else set())
+        left_out = {"name", "summary"}
         sections = [f for f in type(self).model_fields if f not in left_out]
         return self._digest(sections, {"train": {"graphs"}})
 
@@ -264,7 +270,7 @@ class Spec(_Strict):
         """Hashes of checkpoints that belong to this spec, `model_hash` first. The other is of the
         settings that are written in its file: an older hoigs, which had fewer, took it of these,
         and settings that came later do by default what it did."""
-        written = {key: self._document.data.get(key) for key in MODEL_SECTIONS}
+        written = {key: self._document.data.get(key) for key in self._present(MODEL_SECTIONS)}
         blocks = written["model"] if isinstance(written["model"], dict) else {}
         written["model"] = {
             name: {key: value for key, value in block.items() if key not in TRAINING_ONLY}
@@ -273,8 +279,12 @@ class Spec(_Strict):
         }
         return self.model_hash(), _sha256(written)
 
+    def _present(self, sections: Sequence[str]) -> set[str]:
+        return {key for key in sections if key not in LATER or getattr(self, key)}
+
     def _digest(self, sections: Sequence[str], without: dict[str, Any] | None = None) -> str:
-        return _sha256(self.model_dump(mode="json", include=set(sections), exclude=without))
+        include = self._present(sections)
+        return _sha256(self.model_dump(mode="json", include=include, exclude=without))
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Spec) and self.model_dump() == other.model_dump()
@@ -316,7 +326,7 @@ def _resolve(document: Document, registry: Registry) -> Spec:
 
 def _written_components(data: dict[str, Any]) -> Iterator[tuple[Place, ComponentSpec]]:
     """The components of a tree that is no spec as a whole, where each stands."""
-    places: list[Place] = [("rasterizer",), ("interaction",)]
+    places: list[Place] = [("rasterizer",), ("interaction",), ("decoder",)]
     model = data.get("model")
     for name in model if isinstance(model, dict) else ():
         places += [("model", name, field) for field in OF_AN_ENTITY]
@@ -363,17 +373,21 @@ KINDS = ("scene", "human", "object")  # blocks of other names are of one entity,
 
 
 def require_fitting(spec: Spec, registry: Registry) -> None:
-    """Refuse a deformation of other kinds of entity, and features that require what it lacks.
+    """Refuse a deformation of other kinds of entity, features that require what it lacks or give
+    other tokens than the interaction needs, and rates that `train.rates` does not have.
 
-    `compose` refuses both, too; here no clip is needed. A spec is not checked when it is loaded: a
+    `compose` refuses these, too; here no clip is needed. A spec is not checked when it is loaded: a
     search changes one component after the other.
 
     Raises:
         SpecError: a line for each, with its position.
     """
     from hoigs.core.interfaces.features import check_provided
+    from hoigs.core.interfaces.interaction import check_tokens
 
-    found = []
+    found = _unknown_rates(spec, registry)
+    interaction = registry.get(spec.interaction.use)
+    name: Any  # an EntityKind, where it is one
     for name, block in spec.model.items():
         deformation = registry.get(block.deformation.use)
         if name in KINDS and name not in deformation.kinds:
@@ -382,8 +396,11 @@ def require_fitting(spec: Spec, registry: Registry) -> None:
                 f"entities of kind {' or '.join(sorted(deformation.kinds))}, not {name}"
             )
         elif block.features is not None:
+            features = registry.get(block.features.use)
             try:
-                check_provided(registry.get(block.features.use), deformation)
+                check_provided(features, deformation)
+                if name in KINDS:
+                    check_tokens(interaction, features, name)
             except ValueError as error:
                 parts = ("deformation", "features")  # of these, the one that a user wrote
                 places = [spec.at("model", name, part, "use") for part in parts]
@@ -391,3 +408,17 @@ def require_fitting(spec: Spec, registry: Registry) -> None:
                 found.append(f"{place}: {error}")
     if found:
         raise SpecError("\n".join(found))
+
+
+def _unknown_rates(spec: Spec, registry: Registry) -> list[str]:
+    """A line for each learning rate that a component declares and `train.rates` lacks."""
+    found, known = [], rate_names()
+    for place, part in spec.component_specs():
+        declared: Any = getattr(registry.get(part.use), "rates", {})
+        for prefix, rate in declared.items():
+            if rate not in known:
+                found.append(
+                    f'{spec.at(*map(str, place), "use")}: {part.use} declares rates["{prefix}"] as '
+                    f'"{rate}"{did_you_mean(rate, known)}; train.rates has {", ".join(known)}'
+                )
+    return found

@@ -163,6 +163,13 @@ class RatesSpec(_Strict):
         return self.model_copy(update=own) if own else self
 
 
+def rate_names() -> list[str]:
+    """The rates that a component may declare for its parameters (`DeformationModel.rates`)."""
+    shares = ("sh_rest", "settle")
+    names = [n for n, field in RatesSpec.model_fields.items() if field.annotation is float]
+    return [n for n in names if n not in shares and not n.endswith("_final")]
+
+
 class TrainSpec(_Strict):
     """One training run."""
 

@@ -147,6 +147,14 @@ class Camera:
         x = torch.arange(self.width, device=self.K.device, dtype=self.K.dtype) + 0.5
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1)
 
+    def rays(self) -> Float[Tensor, "H W 3"]:
+        """Unit directions in the world of what all pixels show, from `center`."""
+        xy = pinhole_rays(self.K, self.pixel_grid())
+        directions = (
+            torch.cat((xy, torch.ones_like(xy[..., :1])), -1) @ self.world_to_camera[:3, :3]
+        )
+        return directions / directions.norm(dim=-1, keepdim=True)
+
     def moved(self, turn: Float[Tensor, " 3"], shift: Float[Tensor, " 3"]) -> Camera:
         """The camera after a rigid motion in its own space: x_cam = Exp(turn, shift) (R x + t).
 

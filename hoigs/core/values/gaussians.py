@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from hoigs.core.maths.nearest import nearest, surface_normals
 from hoigs.core.maths.rotations import quats_to_matrices, turned_quats
 from hoigs.core.values.shown import one_line
 
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")  # raw, of all Gaussians
 SH_C0 = 0.28209479177387814  # Y_00, so that color = 0.5 + SH_C0 * sh[:, 0]
 
 
@@ -52,6 +53,8 @@ class Gaussians:
         log_scales: natural logarithm of the standard deviations in metres.
         opacity_logits: logit of the opacity; +infinity is drawn as opaque and does not learn.
         sh: spherical-harmonics colour coefficients, K = (degree + 1)^2.
+        channels: what else a decoder reads of each (`hoigs.core.interfaces.decoder`); canonical
+            Gaussians have none, a deformation gives them.
     """
 
     means: Float[Tensor, "N 3"]
@@ -59,6 +62,7 @@ class Gaussians:
     log_scales: Float[Tensor, "N 3"]
     opacity_logits: Float[Tensor, " N"]
     sh: Float[Tensor, "N K 3"]
+    channels: Float[Tensor, "N F"] | None = field(default=None, repr=False)
 
     __repr__ = one_line
 
@@ -91,7 +95,11 @@ class Gaussians:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """Apply `function` to each field."""
-        return Gaussians(**{f.name: function(getattr(self, f.name)) for f in fields(self)})
+        return Gaussians(**{name: function(value) for name, value in self.tensors().items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every field that there is, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     def __getitem__(self, index: Any) -> Gaussians:
         """Rows chosen by a slice, an index tensor or a boolean mask."""
@@ -121,19 +129,20 @@ class Gaussians:
             log_scales=plus(self.log_scales, delta.log_scales),
             opacity_logits=plus(self.opacity_logits, delta.opacity_logits),
             sh=plus(self.sh, delta.sh),
+            channels=self.channels,
         )
 
     def check_finite(self, owner: str = "gaussians") -> None:
         """Raise NotFiniteError naming the first field with NaN or infinity."""
-        for f in fields(self):
-            value = getattr(self, f.name)
+        for name, value in self.tensors().items():
             if not torch.isfinite(value).all():
                 bad = int((~torch.isfinite(value)).reshape(len(self), -1).any(1).sum())
-                raise NotFiniteError(f"{owner}.{f.name}: {bad} of {len(self)} rows are not finite")
+                raise NotFiniteError(f"{owner}.{name}: {bad} of {len(self)} rows are not finite")
 
     @staticmethod
     def cat(parts: Sequence[Gaussians]) -> Gaussians:
-        """All parts in order; lower SH degrees are padded with zeros to the highest."""
+        """All parts in order; lower SH degrees are padded with zeros to the highest, and parts
+        without channels have zeros where others have some."""
         if not parts:
             raise ValueError("Gaussians.cat needs at least one part")
         bands = max(p.sh.shape[1] for p in parts)
@@ -142,12 +151,20 @@ class Gaussians:
             missing = bands - sh.shape[1]
             return torch.cat((sh, sh.new_zeros(sh.shape[0], missing, 3)), 1) if missing else sh
 
+        wide = next((p.channels.shape[1] for p in parts if p.channels is not None), None)
+        channels = None
+        if wide is not None:
+            channels = torch.cat([
+                p.means.new_zeros(len(p), wide) if p.channels is None else p.channels
+                for p in parts
+            ])  # fmt: skip
         return Gaussians(
             means=torch.cat([p.means for p in parts]),
             quats=torch.cat([p.quats for p in parts]),
             log_scales=torch.cat([p.log_scales for p in parts]),
             opacity_logits=torch.cat([p.opacity_logits for p in parts]),
             sh=torch.cat([padded(p.sh) for p in parts]),
+            channels=channels,
         )
 
     @staticmethod

@@ -38,11 +38,13 @@ class Role:
         anchors: points of a human from which reach is measured: pelvis, left wrist, right
             wrist, left foot, right foot; world, metres.
         reach: arm length of a human, metres.
+        gaussians: N, as many as it has now: the rows of `Residual.means`.
     """
 
     kind: EntityKind
     anchors: Float[Tensor, "A 3"] | None = None
     reach: Float[Tensor, ""] | None = None
+    gaussians: int = 0
 
 
 @dataclass(frozen=True)

@@ -100,8 +100,9 @@ def _made(folder: Path, model: SceneModel) -> str:
     if run.provenance.is_file():
         command = run.read_provenance().get("command", "")
     parts = [f"{n}: {type(model.entity(n).deformation).__name__}" for n in model.entities]
-    if model.interaction is not None:
-        parts.append(f"interaction: {type(model.interaction).__name__}")
+    for kind, module in (("interaction", model.interaction), ("decoder", model.decoder)):
+        if module is not None:
+            parts.append(f"{kind}: {type(module).__name__}")
     return sections.made(method, parts, without_home(command))
 
 

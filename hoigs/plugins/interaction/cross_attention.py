@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import torch
@@ -137,6 +138,7 @@ class CrossAttention(InteractionModule):
 
     Config: ClassVar = CrossAttentionConfig
     cuda_graph_safe = True
+    tokens = MappingProxyType({"human": "part", "object": "gaussian"})
 
     def __init__(self, config: CrossAttentionConfig | None = None) -> None:
         super().__init__()

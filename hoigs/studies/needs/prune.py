@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from hoigs.core.interfaces.deformation import DeformationModel, HasKnots, has_knots
 from hoigs.core.interfaces.features import ReadsKnots
-from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.splines import uniform_times
 from hoigs.core.model.knot_refit import (
     KnotTrial,
@@ -150,7 +149,7 @@ def sensitivities(
         rows = state.slices()
         logits = joined.opacity_logits.detach().requires_grad_()
         drawn = model.draw(
-            joined.replace(opacity_logits=logits), camera.to(model.device), RenderRequest()
+            joined.replace(opacity_logits=logits), camera.to(model.device), moment=state.moment
         ).color
         clear = (1 - torch.sigmoid(logits.detach())).clamp_min(SURE)
         squares = torch.zeros_like(clear)

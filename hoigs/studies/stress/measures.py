@@ -106,7 +106,7 @@ def _shares(model: SceneModel, frame: Frame) -> Float[Tensor, "H W 3"]:
         for name, gaussians in state.gaussians.items()
     ]
     request = RenderRequest(features=torch.cat(rows).to(model.device))
-    output = model.draw(state.joined(), frame.camera.to(model.device), request)
+    output = model.rasterize(state.joined(), frame.camera.to(model.device), request)
     assert output.features is not None
     return output.features.cpu()
 

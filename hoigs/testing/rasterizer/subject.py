@@ -14,6 +14,7 @@ from torch import Tensor
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
 from hoigs.core.values.camera import Camera
+from hoigs.core.values.gaussians import FIELDS as RAW
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.oracle import OracleConfig, OracleRasterizer
 from hoigs.testing.checks import (
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 # Small scenes for rasterizers, made on the CPU in float32, the same on every machine.
 
 Value = TypeVar("Value")
-RAW = tuple(f.name for f in fields(Gaussians))
 
 
 @dataclass(frozen=True, eq=False)

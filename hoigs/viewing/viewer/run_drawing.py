@@ -159,7 +159,10 @@ class RunDrawing:
         background = None if plain else gaussians.means.new_tensor(look.background)
         request = RenderRequest(background=background)
         device = self.loaded.model.device
-        return self.loaded.model.draw(gaussians, camera.to(device), request)
+        if colors is not None or plain:
+            return self.loaded.model.rasterize(gaussians, camera.to(device), request)
+        moment = moment_between(self.clip, frame).to(device)
+        return self.loaded.model.draw(gaussians, camera.to(device), request, moment)
 
     def _image(
         self, output: RenderOutput, look: Look, frame: float, camera: Camera

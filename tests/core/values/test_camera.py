@@ -199,3 +199,13 @@ def test_a_camera_on_a_gpu_is_not_waited_for() -> None:
         torch.cuda.set_sync_debug_mode("default")
     with pytest.raises(CameraError, match=r"Camera.K\[2\]"):
         wrong.check()
+
+
+def test_rays_go_to_what_pixels_show() -> None:
+    camera = a_camera()
+    size = (camera.height, camera.width)
+    depth = 1 + torch.rand(size, generator=torch.Generator().manual_seed(0)).to(camera.K)
+    points = camera.unproject(camera.pixel_grid(), depth) - camera.center
+    rays = camera.rays()
+    torch.testing.assert_close(rays * points.norm(dim=-1, keepdim=True), points)
+    torch.testing.assert_close(camera.cropped(2, 1, 3, 2).rays(), rays[1:3, 2:5])

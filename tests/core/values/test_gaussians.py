@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 import torch
@@ -30,8 +28,7 @@ def a_cloud(count: int = 7, degree: int = 1, seed: int = 0) -> Gaussians:
 
 
 def assert_equal(a: Gaussians, b: Gaussians) -> None:
-    for f in fields(a):
-        torch.testing.assert_close(getattr(a, f.name), getattr(b, f.name))
+    torch.testing.assert_close(a.tensors(), b.tensors())
 
 
 def test_activation() -> None:
@@ -135,7 +132,7 @@ def test_from_points_is_3dgs_start() -> None:
 def test_from_points_defaults_and_dtypes() -> None:
     points = torch.zeros(2, 3, dtype=torch.float64)
     cloud = Gaussians.from_points(points, scales=0.3)
-    assert all(getattr(cloud, f.name).dtype == torch.float64 for f in fields(cloud))
+    assert all(x.dtype == torch.float64 for x in cloud.tensors().values())
     torch.testing.assert_close(
         cloud.scales, torch.full((2, 3), 0.3, dtype=torch.float64), rtol=1e-12, atol=0
     )
@@ -228,3 +225,15 @@ def test_from_points_names_the_argument_that_is_wrong(
         Gaussians.from_points(**{"points": torch.rand(4, 3), **arguments})
     for fact in facts:
         assert fact in str(caught.value)
+
+
+def test_channels_go_with_their_rows() -> None:
+    plain, with_channels = a_cloud(), a_cloud().replace(channels=torch.rand(7, 2))
+    assert plain[:3].channels is None and len(with_channels[:3].channels) == 3
+    both = Gaussians.cat([plain, with_channels])
+    assert both.channels[:7].abs().sum() == 0
+    assert torch.equal(both.channels[7:], with_channels.channels)
+    moved = with_channels.moved(GaussianDelta(means=torch.ones(7, 3)))
+    assert torch.equal(moved.channels, with_channels.channels)
+    with pytest.raises(NotFiniteError, match="channels: 7 of 7"):
+        with_channels.replace(channels=torch.full((7, 2), torch.nan)).check_finite()

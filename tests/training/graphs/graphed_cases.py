@@ -127,7 +127,7 @@ def loss(graphed: GraphedScene, model: SceneModel, moment: Moment) -> Tensor:
     deformed = graphed(moment)
     total = torch.zeros((), device=model.device)
     for part in (deformed.state.joined(), deformed.state.gaussians["human"]):
-        for value in vars(part).values():
+        for value in part.tensors().values():
             ramp = torch.linspace(-1, 2, value.numel(), device=value.device).view(value.shape)
             total = total + (ramp * value.sin()).sum()
     for name in model.entities:

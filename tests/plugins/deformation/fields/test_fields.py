@@ -107,7 +107,7 @@ def test_times_outside_are_held(entity):  # F9
     for outside, end in ((-0.3, 0.0), (1.7, 1.0)):
         out, at_end = entity(Moment(outside)), entity(Moment(end))
         torch.testing.assert_close(out.means, at_end.means)
-        assert all(torch.isfinite(value).all() for value in vars(out).values())
+        assert all(torch.isfinite(value).all() for value in out.tensors().values())
 
 
 def test_residuals_displace(entity):
