@@ -221,7 +221,9 @@ def _objects_seen(draft: Draft, options: PrepareOptions) -> dict[str, ObjectSeen
     seen = {}
     for name, thing in draft.objects.items():
         place, turn = errors_of(thing, draft.cameras)
-        seen[name] = ObjectSeen(place_m=place, turn_degrees=turn)
+        shown = thing.ious[np.isfinite(thing.ious)]
+        overlap = float(shown.mean()) if len(shown) else None
+        seen[name] = ObjectSeen(place_m=place, turn_degrees=turn, overlap=overlap)
         found = draft.found_object
         if found is not None and name != options.object_name:
             found = found.further.get(name)

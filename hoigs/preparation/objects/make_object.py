@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.mask_stack import MaskStack, outlines_of
@@ -26,8 +25,9 @@ from hoigs.preparation.objects.ball import (
     contact_radius,
     require_round,
 )
+from hoigs.preparation.objects.explained import colors_of, held_back_error, silhouette_ious
 from hoigs.preparation.objects.filmed import Filmed
-from hoigs.preparation.objects.shape import ColorSampler, held_object, sphere_points
+from hoigs.preparation.objects.shape import held_object, sphere_points
 from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
 from hoigs.preparation.options import ObjectWay
 
@@ -77,38 +77,6 @@ def doubts(
     return found
 
 
-def silhouette_ious(
-    track: ObjectTrack, masks: MaskStack, humans: MaskStack, cameras: Sequence[Camera]
-) -> Float[np.ndarray, " F"]:
-    """Of each frame, intersection over union of the mask and the outline of the track's points,
-    without the person's pixels; NaN where it is not seen. A pixel counts as soon as a point lies
-    in it, which costs an outline of 20 pixels a tenth."""
-    found = np.full(len(masks), np.nan)
-    for i in track.observed.nonzero().flatten().tolist():
-        drawn = _drawn(track, i, cameras[i]) & ~humans[i]
-        union = int((drawn | masks[i]).sum())
-        found[i] = (drawn & masks[i]).sum() / union if union else np.nan
-    return found
-
-
-def _drawn(track: ObjectTrack, frame: int, camera: Camera) -> np.ndarray:
-    """Pixels within the points' outline: the pixels of points, and the gaps between them."""
-    world = track.points @ track.rotations[frame].mT + track.translations[frame]
-    xy, depth = camera.project(world)
-    at = xy[camera.shows(xy, depth)].long().numpy()
-    drawn = np.zeros((camera.height, camera.width), bool)
-    drawn[at[:, 1], at[:, 0]] = True
-    if not len(at):
-        return drawn
-    # half of the points show their side: their spacing in pixels
-    spacing = int(np.ceil(np.sqrt(2 * np.prod(np.ptp(at, axis=0) + 1) / len(at)))) + 1
-    (x0, y0), (x1, y1) = at.min(0), at.max(0) + 1
-    part = np.pad(drawn[y0:y1, x0:x1], spacing)
-    part = ndimage.binary_closing(part, iterations=spacing)
-    drawn[y0:y1, x0:x1] = ndimage.binary_fill_holes(part)[spacing:-spacing, spacing:-spacing]
-    return drawn
-
-
 def _parted(mask: np.ndarray) -> bool:
     labels, count = ndimage.label(mask)
     if count < 2:
@@ -129,10 +97,8 @@ def _on_object(
             yield float(mask[xy[inside, 1], xy[inside, 0]].sum() / len(xy))
 
 
-COLOR_FRAMES = 24  # a median over more changes nothing visible
 FOOTBALL = 0.11  # metres
-COVERED, COVERS_MORE = 0.7, 0.1  # IoU with the masks below which another way is tried, and is taken
-FARTHEST_OUTLINE = 0.5  # of its size: what is farther off its masks is no object
+BETTER = 0.9  # of the error of poses by texture: what the outlines' must be below to be taken
 
 
 def ball_object(
@@ -247,14 +213,14 @@ def make_object(
 
     Args:
         way: how; "auto": as a ball where all masks are round, or else by texture, or by outlines
-            where these cover the masks better.
+            where these explain frames that are held back better.
         radius: of a ball, metres; None: a football's for a tracked ball, and for a round mask that
             which the limbs at it give.
         count: of points.
     """
     masks, cameras, joints = filmed.masks, filmed.cameras, filmed.joints
     hiding = filmed.hiding()
-    colored = partial(_colored, filmed, hiding)
+    colored = partial(_colored, filmed)
     if ball is not None:
         track, normals, spread = ball_object(ball, cameras, radius or FOOTBALL, count)
         confidence = ObjectConfidence.none("ball", len(cameras), "a ball's spin is not tracked")
@@ -272,73 +238,44 @@ def make_object(
         except NoBallError as reason:
             if way == "ball":
                 reasons.append(f"it cannot be posed as a ball: {reason}")
-    made = None
+    by_texture = None
     try:
         if way == "outline":
             raise UntrackableError("object_track is outline")
-        track, normals, confidence = tracked_object(filmed, count, progress)
-        made = colored(track, normals, _spread(track, confidence), confidence)
-        if way == "texture" or np.nanmean(made.ious) >= COVERED:
-            return made
+        by_texture = tracked_object(filmed, count, progress)
+        if way == "texture":
+            return _textured(filmed, *by_texture)
     except UntrackableError as reason:
         reasons.append(str(reason))
-    wrists = None if joints is None else joints[:, [LEFT_WRIST, RIGHT_WRIST]]
-    track, normals, spread = held_object(masks, list(cameras), wrists, count, filmed.depths)
-    confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
-    rough = colored(track, normals, spread, confidence)
-    return rough if made is None else _better_covering(made, rough)
-
-
-def _spread(track: ObjectTrack, confidence: ObjectConfidence) -> float:
-    """How far the shape is off the masks' outlines, relative to its size.
-
-    Raises:
-        UntrackableError: so far that it is no shape.
-    """
-    spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
-    if not spread < FARTHEST_OUTLINE:
-        raise UntrackableError(
-            f"the shape found by its texture is off its masks' outlines by {100 * spread:.0f} "
-            f"% of its size ({100 * FARTHEST_OUTLINE:.0f} % at most)"
+    track, normals, spread = held_object(filmed, count)
+    if by_texture is not None:
+        errors = [held_back_error(t, n, filmed) for t, n in (by_texture[:2], (track, normals))]
+        if errors[1] > BETTER * errors[0]:
+            return _textured(filmed, *by_texture)
+        reasons.append(
+            "in frames held back, what its texture gives is {:.3f} off in colour (of 1), what its "
+            "outlines give {:.3f}: it may be shiny, or not rigid".format(*errors)
         )
-    return spread
+    confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
+    return colored(track, normals, spread, confidence)
 
 
-def _better_covering(made: MadeObject, rough: MadeObject) -> MadeObject:
-    """The track by texture, unless that by outlines covers the masks much better."""
-    by_texture, by_outline = float(np.nanmean(made.ious)), float(np.nanmean(rough.ious))
-    if by_outline < by_texture + COVERS_MORE:
-        return made
-    reason = (
-        f"the poses that its texture gives cover its masks by {by_texture:.2f} (IoU), those of its "
-        f"outlines by {by_outline:.2f}: it may be shiny, or not rigid"
-    )
-    reasons = "; ".join(filter(None, (rough.confidence.reason, reason)))
-    return replace(rough, confidence=replace(rough.confidence, reason=reasons))
+def _textured(
+    filmed: Filmed,
+    track: ObjectTrack,
+    normals: Float[Tensor, "P 3"],
+    confidence: ObjectConfidence,
+) -> MadeObject:
+    spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
+    return _colored(filmed, track, normals, spread, confidence)
 
 
 def _colored(
     filmed: Filmed,
-    hiding: MaskStack,
     track: ObjectTrack,
     normals: Float[Tensor, "P 3"],
     spread: float,
     confidence: ObjectConfidence,
 ) -> MadeObject:
-    track = replace(track, colors=_colors(track, normals, filmed))
-    ious = silhouette_ious(track, filmed.masks, hiding, filmed.cameras)
-    return MadeObject(track, spread, confidence, ious)
-
-
-def _colors(
-    track: ObjectTrack, normals: Float[Tensor, "P 3"], filmed: Filmed
-) -> Float[Tensor, "P 3"]:
-    sampler = ColorSampler(track.points, normals)
-    seen = np.flatnonzero(track.observed.numpy())
-    chosen = set(seen[np.linspace(0, len(seen) - 1, COLOR_FRAMES).round().astype(int)].tolist())
-    for i, image in enumerate(filmed.images()):
-        if i in chosen:
-            sampler.add(
-                image, filmed.masks[i], filmed.cameras[i], track.rotations[i], track.translations[i]
-            )
-    return sampler.colors()
+    track = replace(track, colors=colors_of(track, normals, filmed))
+    return MadeObject(track, spread, confidence, silhouette_ious(track, filmed))

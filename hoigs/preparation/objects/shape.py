@@ -11,12 +11,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 from torch import Tensor
 
+from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.maths.frame_times import fill_gaps, smooth
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.camera import Camera, pinhole_rays
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.mask_stack import MaskStack, Outlines, long_axis, outlines_of
+from hoigs.preparation.mask_stack import MaskStack, Outlines, outlines_of
 from hoigs.preparation.objects.alignment import FACING, Crops, Poses, Surface
+from hoigs.preparation.objects.filmed import Filmed
+from hoigs.preparation.objects.registered import registered
 from hoigs.preparation.video.source import SourceError
 
 
@@ -260,46 +263,44 @@ def _across(vertices: Float[Tensor, "V 3"], view: Float[Tensor, " 3"]) -> Float[
 # an arm may point towards the camera. The hands give the level, the size most of the change.
 SIZE_WEIGHT = 0.75
 SMOOTHING = 15  # frames
+LAID = 0.5  # overlap of the template and a mask from which it lies as the object does
 
 
-def held_object(
-    masks: MaskStack,
-    cameras: Sequence[Camera],
-    wrists: Float[Tensor, "F 2 3"] | None,
-    count: int,
-    depths: Float[np.ndarray, " F"] | None = None,
-) -> tuple[ObjectTrack, Float[Tensor, "P 3"], float]:
-    """A held object: its mask's centroid at the hands' depth, its outline inflated to a shape.
+def held_object(filmed: Filmed, count: int) -> tuple[ObjectTrack, Float[Tensor, "P 3"], float]:
+    """A held object: what one frame shows of it laid over the others, at the hands' depth, its
+    outline inflated to a shape.
 
     Of its rotation only the roll in the image is observable this way; the turning about other
     axes is left to training.
 
     Args:
-        masks: of the object. wrists: left and right, world, metres; None: nobody is there.
-        count: of points, about. depths: of the object, supposed, where nobody is there.
+        count: of points, about.
 
     Returns:
         the track (grey: colours are sampled afterwards), the points' outward normals, and the
         spread of the object's apparent over its expected size.
     """
+    masks, cameras = filmed.masks, filmed.cameras
     outlines = outlines_of(masks)
-    by = "the nearest wrist"
-    if wrists is not None:
-        depths = hand_depths(masks, cameras, wrists)
-    assert depths is not None  # one of both is given
-    if wrists is None:
-        by = "a supposed size"
-    depths = _depths(outlines, depths)
-    pixels = torch.from_numpy(outlines.centers).float()
-    translations = torch.stack(
-        [c.unproject(p, torch.tensor(float(d))) for c, p, d in zip(cameras, pixels, depths)]
-    )
-    # the largest mask that the border does not cut; a cut one only if it is twice as large
-    best = int((outlines.areas * np.where(outlines.whole, 1.0, 0.5)).argmax())
+    if filmed.joints is not None:
+        by = "the nearest wrist"
+        depths = hand_depths(masks, cameras, filmed.joints[:, [LEFT_WRIST, RIGHT_WRIST]])
+    else:
+        assert filmed.depths is not None  # one of both is given
+        by, depths = "a supposed size", filmed.depths
+    found = registered(filmed, outlines)
+    known = found.overlaps >= LAID
+    depths = _depths(np.where(known, found.sizes, np.nan), depths)
+    centers = fill_gaps(found.centers, known)
+    translations = torch.stack([
+        c.unproject(torch.from_numpy(p).float(), torch.tensor(float(d)))
+        for c, p, d in zip(cameras, centers, depths, strict=True)
+    ])  # fmt: skip
+    best = found.template
     rest, normals = inflated_outline(masks[best], cameras[best], float(depths[best]), count)
     to_world = cameras[best].world_to_camera[:3, :3].mT
     rest = (rest - cameras[best].to_camera(translations[best])) @ to_world.mT
-    rotations = _rolls(rest, translations, outlines, cameras)
+    rotations = _rolls(np.where(known, found.angles, np.nan), cameras, best)
     size, spread = apparent_size(rest, rotations, translations, masks, outlines, cameras)
     track = ObjectTrack(
         points=rest * size,
@@ -308,9 +309,10 @@ def held_object(
         translations=translations,
         observed=torch.from_numpy(outlines.observed),
         provenance=(
-            f"mask centroid; depth from {by} and the outline's length; of the "
-            f"rotation only the roll in the image; shape from the outline of frame {best}, half "
-            "as thick as wide: a weak guess"
+            f"frame {best} laid over the others ({int(known.sum())} of them fit, the overlap is "
+            f"{np.nanmedian(found.overlaps):.2f}); depth from {by} and its image size; of its "
+            f"rotation only the roll; shape from the outline of frame {best}, half as "
+            "thick as wide: a weak guess"
         ),
         rotation_known=False,
     )
@@ -347,40 +349,30 @@ def _distance_to(
     return np.linalg.norm(xy[:, None] - edge[None], axis=-1).min(1).astype(np.float64)
 
 
-def _depths(outlines: Outlines, hands: Float[np.ndarray, " F"]) -> Float[np.ndarray, " F"]:
-    """Depths of hands, corrected so that the outline's length agrees; metres, smoothed."""
-    measured = np.isfinite(outlines.lengths)
-    if not measured.any():
-        return smooth(hands, SMOOTHING)
+def _depths(
+    sizes: Float[np.ndarray, " F"], hands: Float[np.ndarray, " F"]
+) -> Float[np.ndarray, " F"]:
+    """Depths of hands, corrected so that its sizes in the image agree; metres, smoothed."""
+    known = np.isfinite(sizes)
     # log of depth by size over depth by hands, up to a constant: the size in metres
-    log_ratio = fill_gaps(-np.log(outlines.lengths * hands), measured)
-    log_ratio -= np.median(log_ratio[measured])
+    log_ratio = fill_gaps(-np.log(sizes * hands), known)
+    log_ratio -= np.median(log_ratio[known])
     return np.exp(smooth(np.log(hands) + SIZE_WEIGHT * log_ratio, SMOOTHING))
 
 
 def _rolls(
-    points: Float[Tensor, "P 3"],
-    translations: Float[Tensor, "F 3"],
-    outlines: Outlines,
-    cameras: Sequence[Camera],
+    angles: Float[np.ndarray, " F"], cameras: Sequence[Camera], template: int
 ) -> Float[Tensor, "F 3 3"]:
-    """Rotations about the viewing axis that lay the points' long axis along the mask's."""
-    known = np.isfinite(outlines.angles)
-    rolls = np.zeros(len(cameras))
-    for i in np.flatnonzero(known).tolist():
-        xy, _ = cameras[i].project(points + translations[i])
-        unturned = long_axis(xy.numpy().astype(np.float64))[1]
-        known[i] = np.isfinite(unturned)
-        rolls[i] = outlines.angles[i] - unturned
-    if not known.any():
-        return torch.eye(3).expand(len(cameras), 3, 3).clone()
-    # an axis has no sign: steps of pi mean nothing
-    steady = np.unwrap(rolls[known], period=np.pi)
-    steady -= np.pi * np.round(np.median(steady) / np.pi)
-    rolls[known] = steady
+    """Rotations about the viewing axis by which what a camera sees of the object is turned in the
+    image against what the template's camera sees."""
+    known = np.isfinite(angles)
+    views = torch.stack([c.world_to_camera[:3, :3] for c in cameras]).double()
+    between = views @ views[template].mT  # a camera that turns about its axis turns the image, too
+    twist = torch.atan2(between[:, 1, 0] - between[:, 0, 1], between[:, 0, 0] + between[:, 1, 1])
+    rolls = angles - twist.numpy()
+    rolls[known] = np.unwrap(rolls[known])
     rolls = smooth(fill_gaps(rolls, known))
-    axes = torch.stack([c.world_to_camera[2, :3] for c in cameras])
-    return axis_angle_to_matrices(axes * torch.from_numpy(rolls).float()[:, None])
+    return axis_angle_to_matrices((views[:, 2] * torch.from_numpy(rolls)[:, None]).float())
 
 
 def apparent_size(

@@ -21,12 +21,14 @@ class ObjectSeen:
         click: the frame of the video in which a click would help most, and why; None: none would.
         place_m: metres by which its place is off from frame to frame, typically.
         turn_degrees: by which its rotation is off, typically; None: its turn cannot be seen.
+        overlap: intersection over union of its outline and its masks, mean; None: not seen.
     """
 
     states: dict[str, list[int]] = field(default_factory=dict)
     click: tuple[int, str] | None = None
     place_m: float | None = None
     turn_degrees: float | None = None
+    overlap: float | None = None
 
     @property
     def share(self) -> float | None:
@@ -87,5 +89,7 @@ def named(seen: ObjectSeen) -> Iterator[tuple[str, str, str]]:
     if seen.share is not None:
         yield "seen, verified", f"{100 * seen.share:.0f} % of the frames", seen.unseen
     yield "place", seen.place, "from frame to frame; all of it scales with its supposed distance"
+    if seen.overlap is not None:
+        yield "outline", f"IoU {seen.overlap:.2f}", "with its masks, mean of the frames"
     if seen.advice:
         yield "best click", f"frame {seen.click[0] if seen.click else ''}", seen.advice

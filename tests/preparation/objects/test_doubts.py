@@ -9,7 +9,9 @@ import torch
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.preparation.mask_stack import MaskStack
-from hoigs.preparation.objects.make_object import doubts, silhouette_ious
+from hoigs.preparation.objects.explained import silhouette_ious
+from hoigs.preparation.objects.filmed import Filmed
+from hoigs.preparation.objects.make_object import doubts
 from hoigs.preparation.objects.shape import sphere_points
 
 FRAMES, WIDTH, HEIGHT = 6, 80, 60
@@ -66,5 +68,8 @@ def test_iou_of_a_ball_and_its_mask() -> None:
         torch.tensor([True, True, False]), "",
     )  # fmt: skip
     nobody = MaskStack([np.zeros_like(disc)] * 3)
-    ious = silhouette_ious(track, MaskStack([disc] * 3), nobody, [camera] * 3)
+    filmed = Filmed(
+        MaskStack([disc] * 3), nobody, nobody, [camera] * 3, lambda: iter(()), 25.0, None, ()
+    )
+    ious = silhouette_ious(track, filmed)
     assert ious[0] > 0.87 and 0.4 < ious[1] < 0.65 and np.isnan(ious[2])

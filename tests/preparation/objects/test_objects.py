@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.mask_stack import MaskStack, long_axis, outlines_of
+from hoigs.preparation.objects.filmed import Filmed
+from hoigs.preparation.objects.registered import registered
 from hoigs.preparation.objects.shape import (
     ColorSampler,
     apparent_size,
@@ -101,6 +106,15 @@ def held() -> tuple[MaskStack, list[Camera], torch.Tensor]:
     return MaskStack(masks), cameras, wrists
 
 
+def filmed(masks: MaskStack, cameras: list[Camera], wrists: torch.Tensor) -> Filmed:
+    """Red things before grey, and nobody's pixels."""
+    joints = torch.zeros(len(masks), RIGHT_WRIST + 1, 3)
+    joints[:, [LEFT_WRIST, RIGHT_WRIST]] = wrists
+    images = [np.where(mask[..., None], (200, 40, 30), 90).astype(np.uint8) for mask in masks]
+    none = MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * len(masks))
+    return Filmed(masks, none, none, cameras, lambda: images, 25.0, joints, (-1,))
+
+
 def test_the_nearest_hand_gives_the_depth() -> None:
     masks, cameras, wrists = held()
     np.testing.assert_allclose(hand_depths(masks, cameras, wrists), 2.0, atol=1e-5)
@@ -112,7 +126,7 @@ def box_of(xy: torch.Tensor) -> torch.Tensor:
 
 def test_held_object_projects_onto_its_mask() -> None:
     masks, cameras, wrists = held()
-    track, normals, spread = held_object(masks, cameras, wrists, 500)
+    track, normals, spread = held_object(filmed(masks, cameras, wrists), 500)
     assert track.observed.tolist() == [i != 4 for i in range(F)]
     assert track.points.shape == normals.shape and spread < 0.05
     for i in range(F):
@@ -129,10 +143,10 @@ def test_size_corrects_hands_that_point_the_wrong_way() -> None:
     depths = np.linspace(2.4, 1.6, 2 * F)
     masks = MaskStack([square(40, 30, round(16 / d)) for d in depths])
     wrist = camera().unproject(torch.tensor([[40.0, 20], [5, 55]]), torch.tensor([2.0, 3]))
-    track, _, _ = held_object(masks, [camera()] * 2 * F, wrist.expand(2 * F, 2, 3), 500)
+    track, _, _ = held_object(filmed(masks, [camera()] * 2 * F, wrist.expand(2 * F, 2, 3)), 500)
     found = track.translations[:, 2].numpy()
     assert np.abs(found - 2.0).max() > 0.2, "hands alone would keep it at 2 m"
-    assert np.abs(found - depths).max() < 0.2
+    assert np.abs(found - depths).max() < 0.22  # masks of whole pixels
 
 
 def test_roll_follows_the_long_axis() -> None:
@@ -149,7 +163,7 @@ def test_roll_follows_the_long_axis() -> None:
     turned[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     side = Camera(side.K, turned, WIDTH, HEIGHT)
     wrist = side.unproject(torch.tensor([[40.0, 20], [5, 55]]), torch.tensor([2.0, 3]))
-    track, _, _ = held_object(masks, [side] * 2 * F, wrist.expand(2 * F, 2, 3), 800)
+    track, _, _ = held_object(filmed(masks, [side] * 2 * F, wrist.expand(2 * F, 2, 3)), 800)
     for i in range(1, 2 * F - 1):
         xy, _ = side.project(track.points @ track.rotations[i].mT + track.translations[i])
         column, row = xy.floor().long().numpy().T
@@ -157,6 +171,33 @@ def test_roll_follows_the_long_axis() -> None:
     torch.testing.assert_close(
         torch.linalg.det(track.rotations), torch.ones(2 * F), atol=1e-5, rtol=0
     )
+
+
+def test_a_turn_is_seen_where_the_border_cuts_and_a_hand_hides() -> None:
+    """Of a thing that is as broad as long, whose colours and corner say how it lies."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    angles, masks, hands, images = np.linspace(0, 2.6, 2 * F), MaskStack(), MaskStack(), []
+    for i, angle in enumerate(angles):
+        cx, cy = 40.0, 30.0 - 2.2 * max(0, i - 6)  # out of the picture, at last by more than half
+        u = (x - cx) * np.cos(angle) + (y - cy) * np.sin(angle)
+        v = (y - cy) * np.cos(angle) - (x - cx) * np.sin(angle)
+        thing = (np.abs(u) < 12) & (np.abs(v) < 12) & ~((u > 4) & (v > 4))
+        hand = np.hypot(x - cx - 10, y - cy) < 5 * (i > 3)
+        image = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+        image[thing] = (200, 40, 30)
+        image[thing & (u < 0)] = (40, 60, 190)
+        image[hand] = (190, 150, 120)
+        masks.append(thing & ~hand)
+        hands.append(hand)
+        images.append(image)
+    wrist = camera().unproject(torch.tensor([[40.0, 20], [5, 55]]), torch.tensor([2.0, 3]))
+    shown = filmed(masks, [camera()] * 2 * F, wrist.expand(2 * F, 2, 3))
+    shown = replace(shown, humans=hands, images=lambda: images)
+    found = registered(shown, outlines_of(masks))
+    off = found.angles - angles + angles[found.template]
+    off = np.abs((off + np.pi) % (2 * np.pi) - np.pi)
+    assert np.degrees(off).max() < 8
+    assert np.abs(found.sizes - 1).max() < 0.1 and found.overlaps.min() > 0.8
 
 
 def test_crumbs_are_no_observation_and_cut_masks_have_no_length() -> None:
@@ -190,4 +231,4 @@ def test_apparent_size_is_the_median_over_whole_masks() -> None:
 def test_an_object_never_seen_is_refused() -> None:
     masks = MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * F)
     with pytest.raises(SourceError, match="every frame"):
-        held_object(masks, *held()[1:], 500)
+        held_object(filmed(masks, *held()[1:]), 500)

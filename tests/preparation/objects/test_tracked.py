@@ -19,7 +19,7 @@ from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.hands import hand_motion, upward
 from hoigs.preparation.objects.make_object import ObjectWay, make_object
 from hoigs.preparation.objects.search import ballistic, flights_by_texture
-from hoigs.preparation.objects.shape import completed, hull, with_samples
+from hoigs.preparation.objects.shape import completed, held_object, hull, with_samples
 from hoigs.preparation.objects.tracked import (
     ObjectConfidence,
     UntrackableError,
@@ -300,10 +300,10 @@ def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(making, "tracked_object", collapsed)
     made = make_object(
-        None, around(images, objects, humans, joints), way="texture", radius=None, count=200,
+        None, around(images, objects, humans, joints), way="auto", radius=None, count=200,
         progress=lambda _: None,
     )  # fmt: skip
-    assert made.confidence.way == "outline" and "off its masks" in made.confidence.reason
+    assert made.confidence.way == "outline" and "held back" in made.confidence.reason
 
 
 @pytest.mark.parametrize(("way", "beside", "taken"), [
@@ -318,15 +318,16 @@ def test_poses_that_leave_the_masks_lose_to_the_outlines(
     shown = around(images, objects, humans, joints)
     settings = {"radius": None, "count": 400, "progress": lambda _: None}
     good = make_object(None, shown, way="outline", **settings)  # type: ignore[arg-type]
+    _, normals, _ = held_object(shown, 400)
 
     def moved(*arguments: object, **_: object) -> object:
         places = good.track.translations + torch.tensor([beside, 0.0, 0.0])
         confidence = replace(
             good.confidence, way="texture and hands", outline=np.full(FRAMES, 0.01)
         )
-        return replace(good.track, translations=places), good.track.points, confidence
+        return replace(good.track, translations=places), normals, confidence
 
     monkeypatch.setattr(making, "tracked_object", moved)
     made = make_object(None, shown, way=way, **settings)  # type: ignore[arg-type]
     assert made.confidence.way == taken
-    assert ("cover its masks by" in made.confidence.reason) == (taken == "outline")
+    assert ("held back" in made.confidence.reason) == (taken == "outline")

@@ -23,13 +23,15 @@ def test_without_a_loss_the_best_click_is_where_doubt_is_greatest_or_nowhere() -
 
 
 def test_an_object_that_is_seen_in_few_frames_is_bad_and_its_other_frames_are_named() -> None:
-    seen = ObjectSeen(by_state(STATES), (14, "it is lost"), place_m=0.05)
+    seen = ObjectSeen(by_state(STATES), (14, "it is lost"), place_m=0.05, overlap=0.8)
     assert seen.share == 0.4 and "turn cannot be seen" in seen.place
     made = replace(report(), frames=len(STATES), objects_seen={"club": seen})
     (one,) = [d for d in made.diagnostics() if d.kind == "club seen"]
     assert one.severity == "bad" and one.frames == (3, 4, 6, 7, 8, 9)
     assert "--object club=X,Y@FRAME" in one.do
-    assert ("club: seen, verified", "40 % of the frames") in [row[:2] for row in made.rows()]
+    rows = [row[:2] for row in made.rows()]
+    assert ("club: seen, verified", "40 % of the frames") in rows
+    assert ("club: outline", "IoU 0.80") in rows
     whole = replace(seen, states=by_state(["seen"] * 10), click=None)
     (one,) = [
         d for d in replace(made, objects_seen={"club": whole}).diagnostics() if "club" in d.kind

@@ -32,6 +32,7 @@ from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overla
 from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, window_of
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 from hoigs.plugins.estimators.object_tracker.states import LOST
+from hoigs.plugins.estimators.object_tracker.unexplained import completed
 from hoigs.plugins.estimators.object_tracker.verified import Known, proof_of, without_unproven
 
 # Frames in which an object was found best, from which it is followed again.
@@ -114,6 +115,7 @@ def followed(
                 for t in (first, again)
             )
         )
+    found = completed(footage, scene, prompts, found, unlike=not known.twins)
     behind = None
     if isinstance(scene, StaticScene):
         behind = Behind.of(footage, scene, found.soft > 127)
