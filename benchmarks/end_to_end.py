@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from estimates.figures import (
     body_figures,
+    body_within,
     camera_motion,
     contact_figures,
     draw_masks,
@@ -106,7 +107,7 @@ def measure(name: str, folder: Path, args: argparse.Namespace) -> Any:
             "warnings": report.warnings,
         }
         made = ClipFolderReader().read(out)
-        row |= figures(made, truth, true_folder, evidence(Path(f"{out}.prepare")), body)
+        row |= figures(made, truth, true_folder, out, body)
         if args.pictures:
             draw_masks(made, args.pictures / f"{name}-{prompt}.png")
         if given and len(made) == len(truth):
@@ -115,8 +116,9 @@ def measure(name: str, folder: Path, args: argparse.Namespace) -> Any:
         yield prompt, row
 
 
-def figures(made: Any, truth: Any, true_folder: Path, found: Any, body: Any) -> dict[str, Any]:
+def figures(made: Any, truth: Any, true_folder: Path, out: Path, body: Any) -> dict[str, Any]:
     """Everything that can be measured without a training."""
+    found = evidence(Path(f"{out}.prepare"))
     row = landmark_figures(np.asarray(found.person.image), truth, body)
     if len(made) != len(truth):
         return row | {"others": f"not computed: {len(made)} of {len(truth)} frames have a camera"}
@@ -125,6 +127,7 @@ def figures(made: Any, truth: Any, true_folder: Path, found: Any, body: Any) -> 
     row["scale_ratio"] = scale_ratio(made, truth)
     world = camera_motion(made, truth)
     row |= body_figures(made, truth, body, world)
+    row |= body_within(made, truth, body, out)
     if "object" not in made.objects:
         return row | {"object_iou": "not computed: no object was found"}
     row["object_iou"] = overlaps([f.masks["object"] for f in made], truth, "object")
