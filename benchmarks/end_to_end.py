@@ -5,7 +5,8 @@
     python benchmarks/end_to_end.py --table benchmarks/results/end_to_end.json
 
 Each clip is written as an mp4 and prepared with the offline estimators (`hoigs estimators install
-mediapipe` comes first), once with a click in the middle of the object in frame 0 and once without.
+mediapipe` comes first), once with a click in the middle of the object in frame 0 and once without;
+or, as `alone`, without an object, for the person's figures only.
 Compared with the truth are masks of person and object, landmarks, focal length, body, and the
 object's place, rotation and shape. `--train` trains on what came out, and on the clip that is
 given cameras, masks and poses; both are scored on the true pixels and in the true masks of test
@@ -26,6 +27,7 @@ from typing import Any
 import numpy as np
 from estimates.figures import (
     body_figures,
+    body_within,
     camera_motion,
     contact_figures,
     draw_masks,
@@ -36,7 +38,7 @@ from estimates.training import Training, trained
 from object_tracking import click_on
 from prepare_alone import evidence
 
-PROMPTS = ("click", "none")
+PROMPTS = ("click", "none", "alone")
 VISIBLE = 0.5  # landmarks below are not compared
 
 
@@ -44,7 +46,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("clips", nargs="*", default=["lift-and-swing", "carry", "throw-and-catch"])
     parser.add_argument("--width", type=int, default=512, help="of the video's square frames")
-    parser.add_argument("--prompt", nargs="+", choices=PROMPTS, default=PROMPTS)
+    parser.add_argument("--prompt", nargs="+", choices=PROMPTS, default=PROMPTS[:2])
     parser.add_argument("--train", type=int, default=0, metavar="STEPS")
     parser.add_argument("--train-width", type=int, default=256)
     parser.add_argument("--keep", type=Path, help="folder in which videos, clips and runs stay")
@@ -90,6 +92,8 @@ def measure(name: str, folder: Path, args: argparse.Namespace) -> Any:
         if prompt == "click":
             x, y, _ = click_on(truth[0].masks["object"].numpy())
             row["object"] = f"{x:.0f},{y:.0f}"
+        elif prompt == "alone":
+            row["object"] = "none"
         start, used = time.perf_counter(), os.times()
         try:
             report = hoigs.prepare(
@@ -106,7 +110,7 @@ def measure(name: str, folder: Path, args: argparse.Namespace) -> Any:
             "warnings": report.warnings,
         }
         made = ClipFolderReader().read(out)
-        row |= figures(made, truth, true_folder, evidence(Path(f"{out}.prepare")), body)
+        row |= figures(made, truth, true_folder, out, body)
         if args.pictures:
             draw_masks(made, args.pictures / f"{name}-{prompt}.png")
         if given and len(made) == len(truth):
@@ -115,8 +119,9 @@ def measure(name: str, folder: Path, args: argparse.Namespace) -> Any:
         yield prompt, row
 
 
-def figures(made: Any, truth: Any, true_folder: Path, found: Any, body: Any) -> dict[str, Any]:
+def figures(made: Any, truth: Any, true_folder: Path, out: Path, body: Any) -> dict[str, Any]:
     """Everything that can be measured without a training."""
+    found = evidence(Path(f"{out}.prepare"))
     row = landmark_figures(np.asarray(found.person.image), truth, body)
     if len(made) != len(truth):
         return row | {"others": f"not computed: {len(made)} of {len(truth)} frames have a camera"}
@@ -125,6 +130,7 @@ def figures(made: Any, truth: Any, true_folder: Path, found: Any, body: Any) -> 
     row["scale_ratio"] = scale_ratio(made, truth)
     world = camera_motion(made, truth)
     row |= body_figures(made, truth, body, world)
+    row |= body_within(made, truth, body, out)
     if "object" not in made.objects:
         return row | {"object_iou": "not computed: no object was found"}
     row["object_iou"] = overlaps([f.masks["object"] for f in made], truth, "object")
@@ -178,7 +184,8 @@ def table(found: dict[str, Any]) -> str:
     """Markdown, one line a row."""
     head = (
         "clip, prompt", "person IoU", "object IoU, worst 5 %", "frames without it", "landmarks px",
-        "focal", "scale", "joints mm, root-aligned", "joints mm", "object mm", "object °",
+        "focal", "scale", "joints mm, root-aligned", "joints mm", "about the shoulders: mm, said",
+        "within", "distance: mm, said", "within", "object mm", "object °",
         "contact F1",
         "PSNR person + object", "all given",
     )  # fmt: skip
@@ -191,7 +198,12 @@ def table(found: dict[str, Any]) -> str:
             f"{_at(row, 'object_iou', 'mean')}, {_at(row, 'object_iou', 'worst')}",
             _at(row, "object_iou", "empty"), _at(row, "landmarks_px", "median"),
             row.get("focal_ratio"), row.get("scale_ratio"), row.get("root_aligned_joints_mm"),
-            row.get("joints_mm"), _at(row, "place_mm", "mean"), _at(row, "rotation_deg", "median"),
+            row.get("joints_mm"),
+            *(cell for part in ("joints", "distance") for cell in (
+                f"{row.get(f'{part}_off_mm')}, {row.get(f'{part}_said_mm')}",
+                row.get(f"{part}_within"),
+            )),
+            _at(row, "place_mm", "mean"), _at(row, "rotation_deg", "median"),
             _at(row, "contact", "f1"),
             *runs,
         )  # fmt: skip

@@ -4,7 +4,8 @@
 
 Needs the recordings that do not ship with the package (`HOIGS_SHARED`). Each camera of `fourviews`
 is prepared by itself, with its lens, and scored by the recording's own `score.py`; lengths are
-millimetres, sizes are the clip's in parts of the truth.
+millimetres, sizes are the clip's in parts of the truth. `within` is the share of the frames in
+which the body is as near to the truth as the clip's report says.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from estimates.figures import within_figures
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 CAMERAS = ("cam02", "cam03", "cam04")  # cam01 sees no elbows
@@ -62,7 +66,28 @@ def measured(data: Path, camera: str, folder: Path) -> dict[str, Any]:
         "acceleration_error": found["acceleration_error"],
         "image_px": found["image_px_median"],
     }
-    return {name: round(value, 3) for name, value in row.items()}
+    return {name: round(value, 3) for name, value in row.items()} | within(data, camera, out)
+
+
+MARKS = {11: 16, 12: 17, 13: 18, 14: 19, 15: 20, 16: 21}  # landmark of the truth -> body joint
+
+
+def within(data: Path, camera: str, out: Path) -> dict[str, Any]:
+    """Whether what the clip's report says of the body holds."""
+    import hoigs
+
+    clip, body, truth = hoigs.read_clip(out), hoigs.AnnyBody(), np.load(data / "truth.npz")
+    view = np.array(json.loads((data / "cameras.json").read_text())["cameras"][camera]
+                    ["world_to_camera"])  # fmt: skip
+    frames = json.loads((out / "clip.json").read_text())["provenance"]["frames"]
+    true = truth["joints"][0, frames][:, list(MARKS)] @ view[:3, :3].T + view[:3, 3]
+    true[~truth["valid"][0, frames][:, list(MARKS)]] = np.nan
+    joints = np.stack([
+        c.to_camera(body(moment.poses["human"]).joints)[list(MARKS.values())].detach().numpy()
+        for c, moment in zip(clip.cameras, clip.moments, strict=True)
+    ])  # fmt: skip
+    report = json.loads((out / "report.json").read_text())
+    return within_figures(joints, true, report["bodies_within"]["human"])
 
 
 def table(rows: dict[str, dict[str, Any]]) -> str:

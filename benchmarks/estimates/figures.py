@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,44 @@ def body_figures(made: Any, truth: Any, body: Any, world: World) -> dict[str, An
         "wrists_mm": round(float(1000 * wrists.mean()), 1),
         "acceleration_error_m_s2": round(float(np.linalg.norm(bend, axis=-1).mean()), 2),
     }
+
+
+SEEN_JOINTS = [16, 17, 18, 19, 20, 21, 1, 2, 4, 5, 7, 8]  # that have landmarks, shoulders first
+
+
+def body_within(made: Any, truth: Any, body: Any, folder: Path) -> dict[str, Any]:
+    """Whether what the clip's report says of the body holds."""
+    seen = []
+    for clip in (made, truth):
+        view = np.stack([c.world_to_camera.double().numpy() for c in clip.cameras])
+        at = _joints(body, clip)[:, SEEN_JOINTS] @ np.swapaxes(view[:, :3, :3], 1, 2)
+        seen.append(at + view[:, None, :3, 3])
+    report = json.loads((folder / "report.json").read_text())
+    return within_figures(*seen, report["bodies_within"]["human"])
+
+
+def within_figures(joints: np.ndarray, true: np.ndarray, within: dict[str, Any]) -> dict[str, Any]:
+    """Millimetres between joints and true ones, [F, J, 3] along the camera's axes with the
+    shoulders first, what the report says of them, and the share of the frames in which it holds.
+
+    Args:
+        true: NaN where it does not count. within: the report's `bodies_within` of the person.
+    """
+    both = np.isfinite(true[:, :2]).all((1, 2))
+    about, true_about = (j - j[:, :2].mean(1, keepdims=True) for j in (joints, true))
+    found = {
+        "joints": np.nanmean(np.linalg.norm(about - true_about, axis=-1)[both], -1),
+        "distance": np.abs((joints - true)[both][:, :2, 2].mean(-1)),
+    }
+    figures = {}
+    for name, off in found.items():
+        said = np.array(within[name], float)[both]
+        figures |= {
+            f"{name}_off_mm": round(float(1000 * np.median(off))),
+            f"{name}_said_mm": round(float(1000 * np.median(said))),
+            f"{name}_within": round(float((off < said).mean()), 2),
+        }
+    return figures
 
 
 def _joints(body: Any, clip: Any) -> np.ndarray:

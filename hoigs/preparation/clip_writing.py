@@ -28,7 +28,7 @@ from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.people import Body
 from hoigs.preparation.report.object_seen import ObjectSeen, best_click, by_state
 from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
-from hoigs.preparation.report.report import PrepareReport
+from hoigs.preparation.report.report import BodyWithin, PrepareReport
 from hoigs.preparation.upright import world_of
 from hoigs.preparation.video.source import SourceError
 
@@ -166,6 +166,16 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
         scene_scale=draft.unit.metres,
         scene_points=len(draft.scene.points),
         body={} if person is None else person.report,
+        bodies_within={
+            name: BodyWithin(
+                _numbers(one.errors.joints.numpy(), 4),
+                _numbers(one.errors.distance.numpy(), 4),
+                round(one.distance(draft.cameras), 3),
+                one.report["size_from"],
+                one.unseen,
+            )
+            for name, one in draft.bodies.items()
+        },
         landmarks={
             name: {
                 "found": int(one.found.sum()),

@@ -18,6 +18,7 @@ from hoigs.core.maths.frame_times import Chunking, fill_gaps, smooth
 from hoigs.core.reporting import ranges
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
+from hoigs.preparation.body.errors import BodyErrors
 from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_problem import FitOptions, Joint, Observations
 from hoigs.preparation.body.landmarks import FrameFates, Landmarks
@@ -121,6 +122,8 @@ class Body:
         ground: largest y of the body, median over frames: the floor's height, if y points down.
         found: frames with landmarks; the body of the others is interpolated.
         fates: why the others have none, and what it took to find some.
+        errors: within which the body is.
+        unseen: parts of it that are hardly ever seen.
         report: measures of the fit.
     """
 
@@ -131,6 +134,8 @@ class Body:
     residuals: Float[Tensor, " F"]
     ground: float
     found: Bool[np.ndarray, " F"]
+    errors: BodyErrors
+    unseen: list[str]
     provenance: str
     report: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -182,6 +187,7 @@ def fit_person(
     for i, (vertices, at) in enumerate(posed(body, fit.poses)):
         joints[i], lowest[i] = at, vertices[:, 1].max()
     residual = float(fit.residual_px.nanmedian())
+    unseen, about = unseen_parts(landmarks), float(fit.errors.joints.median())
     found, solid = int(landmarks.found.sum()), int(landmarks.solid.sum())
     return Body(
         poses=fit.poses,
@@ -191,17 +197,20 @@ def fit_person(
         residuals=fit.residual_px,
         ground=float(lowest.median()),
         found=landmarks.found.numpy(),
+        errors=fit.errors,
+        unseen=unseen,
         provenance=(
             f"fitted to {landmarks.source} landmarks{'' if solid else ' in the image only'} of "
             f"{found} of {len(cameras)} frames{'' if seen.masks is None else ' and to masks'}, "
-            f"{residual:.1f} px off (median of frames); {_size(fit.report, stature(body))}; hands "
-            "are not fitted"
+            f"{residual:.1f} px off (median of frames); {_size(fit.report, stature(body))}; its "
+            f"joints about the shoulders are right to {1000 * about:.0f} mm in four of five "
+            "frames; hands are not fitted"
             f"{'' if chunking is None else _windows(fit.joints, chunking)}"
         ),
         report=fit.report,
         warnings=[
             *_warnings(residual, found, solid, cameras),
-            *_unseen(landmarks),
+            *_unseen(unseen, landmarks),
             *fates_said(fates, len(cameras)),
             *_open_joints(fit.joints),
         ],
@@ -279,10 +288,14 @@ def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]
     return warnings
 
 
-def _unseen(landmarks: Landmarks) -> list[str]:
-    """A sentence for the report if parts of the body are hardly ever seen, else nothing."""
+def unseen_parts(landmarks: Landmarks) -> list[str]:
+    """Parts of the body that are hardly ever seen."""
     seen = landmarks.image[landmarks.found][..., 2] > SEEN
-    parts = [name for name, marks in PARTS.items() if seen[:, marks].any(1).float().mean() < RARELY]
+    return [name for name, marks in PARTS.items() if seen[:, marks].any(1).float().mean() < RARELY]
+
+
+def _unseen(parts: list[str], landmarks: Landmarks) -> list[str]:
+    """A sentence for the report if parts of the body are hardly ever seen, else nothing."""
     if not parts:
         return []
     said = [

@@ -107,6 +107,7 @@ BODIES = 0.065  # standard deviation of the logarithm of adults' size, 0.054 (Go
 FACES = 0.045  # of the same of faces, 0.035, and of what landmarks make of it
 CORNER = 1.0  # pixels that the distance of the eyes' corners is off in all frames alike
 FEWEST = 5  # frames with a face
+ODD = 2.5  # standard deviations: a face that says more is one whose landmarks are wrong
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,8 @@ class Size:
             return Size()
         shown = size * float((faces.noses / depths)[known].median())
         face = FACES**2 + (CORNER / float(faces.eyes[known].median())) ** 2
+        if math.log(max(shown, 1e-3)) ** 2 > ODD**2 * (BODIES**2 + face):
+            return Size()
         share = BODIES**2 / (BODIES**2 + face)
         mean = round(math.exp(share * math.log(shown)), 4)
         return Size(mean, BODIES * math.sqrt(1 - share), "by the face and the mean of adults")

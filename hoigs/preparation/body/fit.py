@@ -15,6 +15,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.moment import BodyPose
+from hoigs.preparation.body.errors import BodyErrors, body_errors
 from hoigs.preparation.body.fit_problem import (
     BodyFit,
     FitOptions,
@@ -116,6 +117,7 @@ def fit_in_windows(
     start = first_guess(body, landmarks, scaled.cameras, False)
     parts: list[BodyPose] = []
     misses: list[Tensor] = []
+    errors: list[BodyErrors] = []
     joints: list[Joint] = []
     before: BodyPose | None = None  # of the next window's first own frame, by the last one
     for number, window in enumerate(windows):
@@ -131,11 +133,12 @@ def fit_in_windows(
         stop = length if last else windows[number + 1].start - window.start + REACH
         parts.append(solved.pose.frame(slice(own, stop)))
         misses.append(problem.misses(solved)[own:stop])
+        errors.append(body_errors(problem, solved, known.size.spread).rows(slice(own, stop)))
         if not last:
             found = replace(found, pose=solved.pose.frame(slice(stop - REACH, stop)))
             before = solved.pose.frame(slice(stop, stop + 1))
     whole = Unknowns(_joined(parts), shared.offsets, shared.unit, shared.scale)
-    result = known.result(whole, torch.cat(misses))
+    result = known.result(whole, torch.cat(misses), BodyErrors.joined(errors))
     counts = {
         "frames_with_landmarks": int(landmarks.found.sum()),
         "frames_with_landmarks_in_space": int(landmarks.solid.sum()),
@@ -225,4 +228,5 @@ def fit_body(
         if seen.masks is not None:
             problem.show(seen.masks)
         unknowns = solve(problem, options.steps, progress)
-        return problem.result(unknowns, problem.misses(unknowns))
+        errors = body_errors(problem, unknowns, problem.size.spread)
+        return problem.result(unknowns, problem.misses(unknowns), errors)

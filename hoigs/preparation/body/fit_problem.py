@@ -15,6 +15,7 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
 from hoigs.core.values.camera import Camera, pinhole_pixels
 from hoigs.core.values.moment import BodyPose
+from hoigs.preparation.body.errors import BodyErrors
 from hoigs.preparation.body.face import Size, faces_of
 from hoigs.preparation.body.kinematics import (
     REACH,
@@ -117,6 +118,7 @@ class BodyFit:
         residual_px: mean distance of visible landmarks per frame, pixels; NaN where unseen.
         scene_scale: metres a unit of the cameras' own world (1 unless it was requested).
         report: numbers for people.
+        errors: within which the poses are.
         joints: of a fit in windows, where one follows another.
     """
 
@@ -124,6 +126,7 @@ class BodyFit:
     residual_px: Float[Tensor, " F"]
     scene_scale: float
     report: dict[str, Any]
+    errors: BodyErrors
     joints: tuple[Joint, ...] = ()
 
 
@@ -602,6 +605,11 @@ class FitProblem:
             equations.shared[: len(betas), : len(betas)] += torch.outer(by_size, by_size)
         return float(values.square().sum()) + larger**2
 
+    def joints(self, unknowns: Unknowns) -> Float[Tensor, "F 22 3"]:
+        """The body's joints along the cameras' axes."""
+        _, joints = self.kinematics.placed(unknowns.pose)
+        return self.in_cameras(joints, unknowns.scale)[1]
+
     def misses(self, unknowns: Unknowns) -> Float[Tensor, "F L"]:
         """Distances of the visible landmarks in the image, pixels; NaN of the others."""
         points = self.posed(unknowns, derivatives=False).points
@@ -609,8 +617,10 @@ class FitProblem:
         distance = (pixels - self.pixels).norm(dim=-1).float()
         return distance.masked_fill(self.visible <= 0.5, torch.nan)
 
-    def result(self, unknowns: Unknowns, misses: Float[Tensor, "F L"]) -> BodyFit:
-        """Pose and report, of the unknowns of all frames and their `misses`."""
+    def result(
+        self, unknowns: Unknowns, misses: Float[Tensor, "F L"], errors: BodyErrors
+    ) -> BodyFit:
+        """Pose and report, of the unknowns of all frames, their `misses` and errors."""
         mean = float(misses.nanmean())
         report = {
             "landmark_error_px": round(mean, 2),
@@ -630,7 +640,7 @@ class FitProblem:
             "scene_scale_from": self.scale_from,
         }
         pose = unknowns.pose.map(lambda x: x.float())
-        return BodyFit(pose, misses.nanmean(1), unknowns.scale, report)
+        return BodyFit(pose, misses.nanmean(1), unknowns.scale, report, errors)
 
 
 def _by_place(K: Float[Tensor, "F 3 3"], cam: Float[Tensor, "F L 3"]) -> Float[Tensor, "F L 2 3"]:

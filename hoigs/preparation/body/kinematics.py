@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dtbtrs
 from torch import Tensor
 
 from hoigs.core.interfaces.body import BodyModel
@@ -288,6 +291,29 @@ class NormalEquations:
             return None
         step = -(solved[:, 0] + solved[:, 1:] @ down).unflatten(0, (frames, width))
         return (step, down) if bool(torch.isfinite(step).all()) else None
+
+    def draws(
+        self, count: int, generator: torch.Generator
+    ) -> Iterator[tuple[Float[Tensor, "F N"], Float[Tensor, " S"]]]:
+        """Drawn from the normal distribution whose inverse covariance H is, of frames and shared
+        unknowns (Rue and Held 2005, algorithm 2.4, with the border's by its Schur complement).
+
+        Raises:
+            LinAlgError: H is not positive definite.
+        """
+        frames, width = self.by_frame.shape
+        factor = cholesky_banded(self._band(0.0), overwrite_ab=True, check_finite=False)
+        border = self.border.flatten(0, 1)
+        solved = torch.from_numpy(cho_solve_banded((factor, False), border.numpy()))
+        left = torch.linalg.cholesky(
+            self.shared + 1e-9 * torch.eye(len(self.shared)).double() - border.T @ solved
+        )
+        normal = partial(torch.randn, generator=generator, dtype=torch.float64)
+        for _ in range(count):
+            own, _ = dtbtrs(factor, normal(frames * width, 1).numpy())
+            shared = torch.linalg.solve_triangular(left.mT, normal(len(left), 1), upper=True)
+            own = torch.from_numpy(own) - solved @ shared
+            yield own.unflatten(0, (frames, width))[..., 0].reshape(frames, width), shared[:, 0]
 
     def _band(self, damping: float) -> Float[np.ndarray, "K M"]:
         """Upper diagonals of the frames' part, as LAPACK stores them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from html import escape
@@ -19,6 +20,23 @@ from hoigs.preparation.report.object_seen import SEEN, ObjectSeen, named
 
 
 @dataclass(frozen=True)
+class BodyWithin:
+    """Within which a body is in four of five frames; of each frame, metres.
+
+    Attributes:
+        joints: mean distance of the joints that are seen, about the middle of the shoulders.
+        distance: of that middle from the camera. away: how far off the person is, median.
+        size_from: how the body's size is known. unseen: parts that are hardly ever seen.
+    """
+
+    joints: list[float | None]
+    distance: list[float | None]
+    away: float
+    size_from: str
+    unseen: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
 class Measures:
     """Numbers to judge a prepared clip by.
 
@@ -29,7 +47,7 @@ class Measures:
         coverage: by entity, part of the image that the mask covers in each frame, 0..1.
         body_residual_px: median distance of fitted to given landmarks, in frame pixels, of the
             first person; None without people.
-        body: whatever else the body fit reports.
+        body: whatever else the body fit reports. bodies_within: by person, how far it may be off.
         landmarks: by person, `found`: frames with landmarks; `lost` and `repaired`: by the reason,
             which frames have none, and which only after more than a first look.
         scene_scale: metres a COLMAP unit; 1 for a static camera.
@@ -84,6 +102,7 @@ class Measures:
     object_observed: float | None
     scene_points: int
     body: dict[str, Any] = field(default_factory=dict)
+    bodies_within: dict[str, BodyWithin] = field(default_factory=dict)
     landmarks: dict[str, dict[str, Any]] = field(default_factory=dict)
     provenance: dict[str, str] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
@@ -279,6 +298,37 @@ def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
         )
 
 
+def _in_space(report: Measures) -> Iterator[MeasureDiagnostic]:
+    """How far each body may be off, which its landmarks in the image do not show."""
+    low, high = report.focal_range or (1.0, 1.0)
+    for name, within in report.bodies_within.items():
+        off, worst = _middle(within.joints, 0.5), _middle(within.joints, 0.95)
+        yield _judged(
+            f"joints of {name}",
+            f"± {1000 * off:.0f} mm",
+            "those that are seen, about the shoulders, on average in four of five frames; "
+            f"± {1000 * worst:.0f} mm in the worst twentieth of them",
+            _judge(off, 0.05, 0.1),
+            "limbs that point to the camera or away from it are known least: judge the body from "
+            "other sides than the camera's, and film with a camera that moves around the person",
+        )
+        share = math.hypot(_middle(within.distance, 0.5) / within.away, max(high - 1, 1 - low))
+        legs = "; with the legs out of view nothing else shows it" * ("legs" in within.unseen)
+        yield _judged(
+            f"distance of {name}",
+            f"± {100 * share:.0f} %",
+            f"{100 * share * within.away:.0f} cm, as the body's size, which is {within.size_from}"
+            f"{legs}",
+            _judge(share, 0.05, 0.1),
+            "give --person-height, if you know it",
+        )
+
+
+def _middle(values: Sequence[float | None], quantile: float) -> float:
+    known = sorted(v for v in values if v is not None)
+    return known[int(quantile * (len(known) - 1))]
+
+
 def _landmarks(report: Measures) -> Iterator[MeasureDiagnostic]:
     """Frames with landmarks of each person; every other one with its reason."""
     for name, of in report.landmarks.items():
@@ -303,6 +353,7 @@ def _landmarks(report: Measures) -> Iterator[MeasureDiagnostic]:
 def _tracks(report: Measures) -> Iterator[MeasureDiagnostic]:
     yield from _landmarks(report)
     yield from _bodies(report)
+    yield from _in_space(report)
     if report.object_scale_spread is not None:
         yield _judged(
             "object's apparent size",
@@ -501,6 +552,9 @@ def _plots(report: Measures) -> str:
         plots.append(plot("Sharpness", {"": report.sharpness}))
     if any(v is not None for v in report.body_residuals_px):
         plots.append(plot("Body off its landmarks, px", {"": report.body_residuals_px}))
+    for name, within in report.bodies_within.items():
+        off = [None if v is None else 1000 * v for v in within.joints]
+        plots.append(plot(f"Joints of {name} within, mm", {"": off}))
     if any(v is not None for v in report.object_agreement):
         plots.append(plot("Object's texture against other frames", {"": report.object_agreement}))
     if any(v is not None for v in report.depth_residuals):

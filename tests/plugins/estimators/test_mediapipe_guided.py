@@ -61,6 +61,24 @@ def test_the_best_square_is_followed() -> None:
     assert graph.looks == tried + 2  # the picture and the mirrored one
 
 
+def test_whoever_is_found_late_is_followed_back_until_they_are_not_seen() -> None:
+    graph = Graph()
+    pose = guided(graph)
+    pose.process(IMAGE, None)
+    square = pose.square
+
+    def before():
+        graph.places = {mark: (x + 3, y) for mark, (x, y) in PLACES.items()}
+        yield IMAGE, None
+        graph.turned = True
+        yield IMAGE, None
+        pytest.fail("the person was lost in the frame after this one")
+
+    shown = [points[11, 0] for points, *_ in pose.earlier(before())]
+    assert shown == pytest.approx([113])
+    assert pose.square == square and pose.shoulders[0].tolist() == pytest.approx([110, 10])
+
+
 def test_a_part_of_the_person_is_not_taken_for_the_whole() -> None:
     graph = Graph()
     pose = guided(graph)

@@ -111,6 +111,10 @@ def test_a_known_pose_is_found() -> None:
     assert fit.report["frames_with_landmarks"] == FRAMES
     assert fit.scene_scale == 1.0
     assert fit.poses.hand_pose_convention == "flat"
+    off = fit.poses.transl[:, 2] - truth().transl[:, 2]
+    assert (off.abs() < fit.errors.distance).all() and (fit.errors.distance < 1).all()
+    # a third of a second hardly shows depth: the network's error lasts longer
+    assert (errors[:, 16:22].mean(1) < fit.errors.joints).all() and (fit.errors.joints < 0.4).all()
 
 
 def test_a_known_height_scales_the_body_and_its_distance() -> None:
@@ -120,6 +124,7 @@ def test_a_known_height_scales_the_body_and_its_distance() -> None:
     assert fit.residual_px.max() < 3.0
     nearer = fit.poses.transl[:, 2] / usual.poses.transl[:, 2]
     assert nearer.mean() == pytest.approx(0.92, abs=0.015)
+    assert (fit.errors.distance < 0.5 * usual.errors.distance).all()
     assert 1.5 < stature(body()) < 1.9
 
 
@@ -199,6 +204,7 @@ def test_first_and_last_frames_may_be_unseen() -> None:
     image[[0, 1, FRAMES - 1]] = torch.nan
     fit = fit_body(body(), Observations(replace(landmarks, image=image), cameras), options=QUICK)
     assert joint_errors(fit.poses, truth()).mean() < 0.08
+    assert fit.errors.joints[[0, FRAMES - 1]].min() > fit.errors.joints[3:6].max()
 
 
 def test_an_outlier_landmark_is_outvoted() -> None:

@@ -68,6 +68,8 @@ def test_a_large_face_is_believed_the_less_the_smaller_it_is_in_the_image() -> N
     assert 1.05 < near.mean < 1.08
     assert 1.0 < far.mean < 1.04
     assert near.spread < far.spread < BODIES
+    odd = Faces(torch.full((9,), 1.6), torch.full((9,), 12.0))
+    assert Size.by_face(1.0, torch.ones(9), odd) == Size()
     # what was found of a body that has that size already is the same
     again = Size.by_face(near.mean, torch.full((9,), near.mean), Faces(noses, torch.full((9,), 80)))
     assert again.mean == pytest.approx(near.mean, abs=1e-3)

@@ -113,6 +113,13 @@ def test_a_step_solves_the_whole_system() -> None:
     found = equations.step(0.0)
     assert found is not None
     torch.testing.assert_close(torch.cat((found[0].flatten(), found[1])), dense)
+    # draws spread as the inverse of the matrix says, and no otherwise in any direction
+    inverse = torch.linalg.inv(jacobian.T * weights @ jacobian)
+    rows = [torch.cat((a.flatten(), b)) for a, b in equations.draws(4000, draw)]
+    spread = torch.linalg.solve_triangular(
+        torch.linalg.cholesky(inverse), torch.stack(rows).T, upper=False
+    ).cov()
+    torch.testing.assert_close(spread, torch.eye(len(spread)).double(), atol=0.12, rtol=0)
 
 
 def test_derivatives_of_a_few_frames_at_a_time_give_the_same_equations(

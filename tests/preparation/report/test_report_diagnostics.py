@@ -13,7 +13,7 @@ from test_prepare_report import report
 
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.cameras.camera_track import angular_factor, full_factor
-from hoigs.preparation.report.report import diagnose, plot, report_page
+from hoigs.preparation.report.report import BodyWithin, diagnose, plot, report_page
 
 
 def states(**changes: object) -> dict[str, tuple[str, str]]:
@@ -44,6 +44,18 @@ def test_a_body_that_few_frames_show_is_not_good() -> None:
     few = {"human": {"found": 4, "lost": {"dark": [*range(4, 40)]}, "repaired": {}}}
     judged = states(body_residual_px=0.5, landmarks=few)
     assert judged["body on its landmarks"][0] == judged["landmarks of human"][0] == "bad"
+
+
+def test_a_body_is_said_to_be_as_far_off_as_it_may_be() -> None:
+    within = BodyWithin([0.04, 0.06, None, 0.2], [0.1] * 4, 2.0, "taken for the mean", ["legs"])
+    judged = {
+        d.kind: d for d in diagnose(dataclasses.replace(report(), bodies_within={"ann": within}))
+    }
+    joints, distance = judged["joints of ann"], judged["distance of ann"]
+    assert joints.value == "± 60 mm" and joints.severity == "fair"
+    assert distance.value == "± 5 %" and "legs" in distance.what
+    wide = dataclasses.replace(report(), bodies_within={"ann": within}, focal_range=(0.7, 1.5))
+    assert {d.kind: d.severity for d in diagnose(wide)}["distance of ann"] == "bad"
 
 
 def test_a_static_camera_is_not_asked_for_parallax() -> None:

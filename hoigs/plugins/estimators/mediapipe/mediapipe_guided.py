@@ -95,6 +95,21 @@ class GuidedPose:
             return None
         return self.follow(found)
 
+    def earlier(self, frames):
+        """What `process` gives for frames before the one in which somebody was found, the latest
+        first, as long as they are seen there; the way ahead goes on from the frame found.
+
+        Args:
+            frames: images with their masks of people, or None.
+        """
+        now = self.square, self.around, self.shoulders, self.placed
+        for image, wide in frames:
+            found, why = self.followed(image, wide)
+            if found is None or why:
+                break
+            yield self.follow(found)
+        self.square, self.around, self.shoulders, self.placed = now
+
     def followed(self, image, wide):
         """What is seen in the square that showed the person last, or in the one about the first
         that leaves the least doubt, and why it is not believed."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ PADDING = 0.5  # of the height, above: a detector of faces finds people whose he
 MARGIN = 1.25  # of the person's box, the second look at the person's mask
 OTHER, ELSEWHERE = 0.25, 0.2  # of the largest part's area; of a part, that is the person's own
 AROUND = 0.01  # of the longer side, to both sides of the outline of the pose's own mask
+EARLIER = 300  # frames at most in which somebody who is found late is looked for
 ROWS = ("image_xyzv", "world_xyzv")
 SOFT = 1 / 640  # of the longer side: standard deviation by which the person's mask is smoothed
 
@@ -95,6 +97,7 @@ class Finder:
         self.guided: Any = None
         self.last: Any = None  # where the person was last, and how tall, pixels
         self.complexity = settings["pose"]["model_complexity"]
+        self.unseen: Any = deque(maxlen=EARLIER)  # frames since the last that showed the person
         self.following = False  # a person whom `guided` found and the detector does not
         self.people: Any = None
         names, frames = [""], range(settings["count"])
@@ -132,7 +135,34 @@ class Finder:
         if self.people is not None:
             self.add_people(place, image, wide)
             return
-        image_xyzv, world_xyzv, own, self.fate[0, place] = self.landmarks(image, wide)
+        found = self.landmarks(image, wide)
+        self.keep(place, image, wide, found)
+        if np.isnan(found[0]).all():
+            self.unseen.append((place, self.cv2.imencode(".jpg", image[..., ::-1])[1]))
+        elif self.unseen:
+            if self.following:
+                self.look_back()
+            self.unseen.clear()
+
+    def look_back(self):
+        """Whoever was found without the detector, late or again, in the frames before."""
+        last, shown = self.last, []
+
+        def frames():
+            for place, encoded in reversed(self.unseen):
+                image = np.ascontiguousarray(self.cv2.imdecode(encoded, 1)[..., ::-1])
+                wide = self.selfie and self.selfie.process(image).segmentation_mask
+                shown[:] = place, image, wide
+                yield image, wide
+
+        for found in self.guided.earlier(frames()):
+            self.alone[shown[0]] = False
+            self.keep(*shown, found)
+        self.last = last
+
+    def keep(self, place, image, wide, found):
+        """Landmarks, fate and mask of a frame."""
+        image_xyzv, world_xyzv, own, self.fate[0, place] = found
         self.rows["image_xyzv"][0, place] = image_xyzv
         self.rows["world_xyzv"][0, place] = world_xyzv
         seen = image_xyzv[image_xyzv[:, 3] > 0.5, :2]

@@ -1,0 +1,91 @@
+"""How far a fitted body may be off from the truth, by what the fit leaves open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hoigs.preparation.body.kinematics import JOINTS, PER_FRAME, NormalEquations
+from hoigs.preparation.body.landmarks import JOINTS as JOINT_OF
+
+if TYPE_CHECKING:
+    from hoigs.preparation.body.fit_problem import FitProblem, Unknowns
+
+DRAWS = 48
+SHOULDERS = [16, 17]  # body joints
+VISIBLE = 0.5
+SHARE = 0.8  # of the frames, in which the body is to be within its errors
+# factor with which the errors hold, as a network's landmarks are off alike over whole clips, which
+# the fit takes for noise (benchmarks/landmark_errors.py, real.py and end_to_end.py)
+ALIKE = 1.8
+
+
+@dataclass(frozen=True)
+class BodyErrors:
+    """Within which a body is in four of five frames, metres.
+
+    Attributes:
+        joints: mean distance of the seen joints from the true ones, both about the middle of the
+            shoulders. distance: of that middle along the camera's axis.
+    """
+
+    joints: Float[Tensor, " F"]
+    distance: Float[Tensor, " F"]
+
+    def rows(self, frames: slice) -> BodyErrors:
+        """Of some frames alone."""
+        return BodyErrors(self.joints[frames], self.distance[frames])
+
+    @staticmethod
+    def joined(parts: Sequence[BodyErrors]) -> BodyErrors:
+        """Of the frames of all parts, in order."""
+        return BodyErrors(
+            torch.cat([part.joints for part in parts]),
+            torch.cat([part.distance for part in parts]),
+        )
+
+
+def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyErrors:
+    """By draws from the normal distribution about the most probable body (Laplace 1774).
+
+    The size of the body, which the fit takes for all but known, is drawn beside it: a larger body
+    that is farther off by as much is seen alike. The scale of the cameras' world is not.
+
+    Args:
+        spread: standard deviation of the logarithm of the body's size.
+    """
+    frames = len(unknowns.pose.transl)
+    equations = NormalEquations(frames, PER_FRAME, problem.count_shared(unknowns))
+    problem.energy(unknowns, 1.0, equations)
+    generator = torch.Generator().manual_seed(0)
+    best, seen = problem.joints(unknowns), _seen(problem)
+    joints, distances = [], []
+    for own, shared in equations.draws(DRAWS, generator):
+        shared[-1:] = 0  # the scale: one that nothing shows would be drawn from everywhere
+        size = math.exp(spread * float(torch.randn((), generator=generator)))
+        at = size * problem.joints(unknowns.moved(own, shared))
+        distances.append((at - best)[:, SHOULDERS, 2].mean(1).abs())
+        off = (_about_shoulders(at) - _about_shoulders(best)).norm(dim=-1)
+        joints.append((off * seen).sum(1) / seen.sum(1))
+    within = [ALIKE * torch.stack(found).quantile(SHARE, 0) for found in (joints, distances)]
+    return BodyErrors(*(errors.float() for errors in within))
+
+
+def _seen(problem: FitProblem) -> Float[Tensor, "F 22"]:
+    """1 for the joints that are seen; for all that have landmarks, where none is."""
+    seen = torch.zeros(len(problem.visible), JOINTS, dtype=torch.float64)
+    marks = [problem.points.index(mark) for mark in JOINT_OF]
+    shown = (problem.visible[:, marks] > VISIBLE).double()
+    shown[shown.sum(1) == 0] = 1
+    seen[:, list(JOINT_OF.values())] = shown
+    return seen
+
+
+def _about_shoulders(joints: Float[Tensor, "F J 3"]) -> Float[Tensor, "F J 3"]:
+    return joints - joints[:, SHOULDERS].mean(1, keepdim=True)
