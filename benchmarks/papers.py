@@ -48,12 +48,12 @@ def scores(clip: str, spec: str | Path, settings: tuple[str, ...], out: Path) ->
         clip, spec, out=out, plugins=[STG, SOM], device="cpu", overrides=settings
     )  # fmt: skip
     assert done.evaluated is not None
-    found = {}
+    evaluation, found = done.evaluated.evaluation, {}
     for view in ("test frames", "held-out cameras"):
         for region in ("full", "human_object"):
-            for score in done.evaluated.evaluation.scores:
-                if (score.view, score.region, score.metric) == (view, region, "psnr"):
-                    found[f"{view}, {region}"] = score.value
+            score = evaluation.score(region, "psnr", view)
+            assert isinstance(score, float)
+            found[f"{view}, {region}"] = round(score, 2)
     return found
 
 
