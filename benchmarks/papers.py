@@ -1,8 +1,8 @@
 """The ports of examples/papers on a built-in clip, with and without what each brings: PSNR.
 
-    python benchmarks/papers.py --out docs/results/papers.json
+    python benchmarks/papers.py --out benchmarks/results/papers.json
 
-Every training is of the same length and picture size; ten minutes on two CPU cores.
+Every training is of the same length and picture size; 20 minutes on a CPU that others use.
 """
 
 from __future__ import annotations
