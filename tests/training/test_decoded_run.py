@@ -16,6 +16,7 @@ from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.testing.material import moment_at, tiny_clip, tiny_scene
 from hoigs.viewing.playback import Playback
+from hoigs.viewing.player.page import write_page
 from hoigs.viewing.viewer.run_drawing import Look, RunDrawing
 
 PAPERS = Path(__file__).parents[2] / "examples" / "papers"
@@ -85,7 +86,9 @@ def test_a_draw_without_a_moment_says_what_is_missing(loaded):
         loaded.model.draw(loaded.model(moment).joined(), camera)
 
 
-def test_colours_alone_are_not_exported(trained, tmp_path):
+def test_colours_alone_are_not_exported(trained, loaded, tmp_path):
+    with pytest.raises(HoigsError, match=r"page run\.html .*FeatureDecoder, makes the pictures"):
+        write_page(loaded, tmp_path / "run.html")
     with pytest.raises(HoigsError, match=r"PlyExporter.*FeatureDecoder, makes the pict"):
         h.export(trained, format="ply", out=tmp_path / "ply", plugins=[PLUGIN], device="cpu")
     assert not (tmp_path / "ply").exists()

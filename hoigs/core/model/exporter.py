@@ -102,6 +102,18 @@ class Exported:
         return "\n".join([*lines, *(f"supposed: {k}: {v}" for k, v in self.supposed.items())])
 
 
+def require_own_colors(scene: SceneModel, who: str) -> None:
+    """Raise HoigsError where a decoder makes the pictures of the scene, which `who` writes without
+    one."""
+    if scene.decoder is not None:
+        raise HoigsError(
+            f"{who} writes Gaussians or surfaces with colours, and a decoder, "
+            f"{name_of(scene.decoder)}, makes the pictures of this scene: in another program they "
+            "would look otherwise. `hoigs render` and `hoigs view` use the decoder; formats of a "
+            "skeleton alone, such as bvh, can be exported"
+        )
+
+
 class Exporter(Configurable, ABC):
     """One file format.
 
@@ -159,14 +171,8 @@ class Exporter(Configurable, ABC):
             HoigsError: `out` exists, a decoder makes the scene's pictures, which the colours of the
                 Gaussians are not, `write` left no file in it, or as `write`.
         """
-        decoder = request.scene.decoder
-        if decoder is not None and self.reads_gaussians:
-            raise HoigsError(
-                f"{type(self).__name__} writes Gaussians or surfaces with colours, and a decoder, "
-                f"{name_of(decoder)}, makes the pictures of this scene: in another program they "
-                "would look otherwise. `hoigs render` and `hoigs view` use the decoder; formats of "
-                "a skeleton alone, such as bvh, can be exported"
-            )
+        if self.reads_gaussians:
+            require_own_colors(request.scene, type(self).__name__)
         if out.exists() or out.is_symlink():
             raise HoigsError(f"{out} exists and is not replaced; name another folder to write")
         omitted = self._unsuited(request)

@@ -14,7 +14,7 @@ import torch
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.model.compose import compose_bodies
-from hoigs.core.model.exporter import ExportRequest
+from hoigs.core.model.exporter import ExportRequest, require_own_colors
 from hoigs.core.model.standing import in_known_world
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.files import write_whole
@@ -63,11 +63,13 @@ def write_page(
         entities: names; all by default.
 
     Raises:
-        HoigsError: an entity is unknown, the size cannot be reached, or the disk is full.
+        HoigsError: an entity is unknown, a decoder makes the pictures of the run, the size cannot
+            be reached, or the disk is full.
     """
     path, report = Path(path), progress or no_progress
     if path.suffix.lower() not in (".html", ".htm"):
         raise HoigsError(f"{path}: expected a name that ends in .html")
+    require_own_colors(loaded.model, f"the page {path.name}")
     request = _request(loaded, entities)
     with torch.no_grad():
         whole = collect(request, Gltf4dConfig().modes, report)
