@@ -21,9 +21,9 @@ DRAWS = 48
 SHOULDERS = [16, 17]  # body joints
 VISIBLE = 0.5
 SHARE = 0.8  # of the frames, in which the body is to be within its errors
-# factor with which the errors hold, as a network's landmarks are off alike over whole clips, which
-# the fit takes for noise (benchmarks/landmark_errors.py, real.py and end_to_end.py)
-ALIKE = 1.8
+# factors of joints and distance with which these errors hold: a network's landmarks are off alike
+# over whole clips, which the fit takes for noise (benchmarks/real.py, end_to_end.py)
+ALIKE = (2.0, 1.6)
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyE
         distances.append((at - best)[:, SHOULDERS, 2].mean(1).abs())
         off = (_about_shoulders(at) - _about_shoulders(best)).norm(dim=-1)
         joints.append((off * seen).sum(1) / seen.sum(1))
-    within = [ALIKE * torch.stack(found).quantile(SHARE, 0) for found in (joints, distances)]
-    return BodyErrors(*(errors.float() for errors in within))
+    within = (torch.stack(found).quantile(SHARE, 0).float() for found in (joints, distances))
+    return BodyErrors(*(factor * errors for factor, errors in zip(ALIKE, within, strict=True)))
 
 
 def _seen(problem: FitProblem) -> Float[Tensor, "F 22"]:
