@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.preparation.body.fit_problem import FitProblem, Unknowns
+from hoigs.preparation.body.fitted import BodyErrors
 from hoigs.preparation.body.kinematics import JOINTS, PER_FRAME, NormalEquations
 from hoigs.preparation.body.landmarks import JOINTS as JOINT_OF
-
-if TYPE_CHECKING:
-    from hoigs.preparation.body.fit_problem import FitProblem, Unknowns
 
 DRAWS = 48
 SHOULDERS = [16, 17]  # body joints
@@ -24,31 +20,6 @@ SHARE = 0.8  # of the frames, in which the body is to be within its errors
 # factors of joints and distance with which these errors hold: a network's landmarks are off alike
 # over whole clips, which the fit takes for noise (benchmarks/real.py, end_to_end.py)
 ALIKE = (2.0, 1.6)
-
-
-@dataclass(frozen=True)
-class BodyErrors:
-    """Within which a body is in four of five frames, metres.
-
-    Attributes:
-        joints: mean distance of the seen joints from the true ones, both about the middle of the
-            shoulders. distance: of that middle along the camera's axis.
-    """
-
-    joints: Float[Tensor, " F"]
-    distance: Float[Tensor, " F"]
-
-    def rows(self, frames: slice) -> BodyErrors:
-        """Of some frames alone."""
-        return BodyErrors(self.joints[frames], self.distance[frames])
-
-    @staticmethod
-    def joined(parts: Sequence[BodyErrors]) -> BodyErrors:
-        """Of the frames of all parts, in order."""
-        return BodyErrors(
-            torch.cat([part.joints for part in parts]),
-            torch.cat([part.distance for part in parts]),
-        )
 
 
 def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyErrors:
