@@ -24,7 +24,8 @@ from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit, Observations
+from hoigs.preparation.body.fit_problem import Observations
+from hoigs.preparation.body.fitted import BodyFit
 from hoigs.preparation.body.landmarks import Landmarks
 
 WIDTH, HEIGHT, FOCAL, FPS = 1280, 720, 1536.0, 24

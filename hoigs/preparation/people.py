@@ -18,9 +18,9 @@ from hoigs.core.maths.frame_times import Chunking, fill_gaps, smooth
 from hoigs.core.reporting import ranges
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.errors import BodyErrors
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import FitOptions, Joint, Observations
+from hoigs.preparation.body.fit_problem import FitOptions, Observations
+from hoigs.preparation.body.fitted import BodyErrors, Joint
 from hoigs.preparation.body.landmarks import FrameFates, Landmarks
 from hoigs.preparation.body.mask_fit import posed
 from hoigs.preparation.cameras.camera_track import CameraTrack

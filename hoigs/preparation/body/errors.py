@@ -3,52 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hoigs.preparation.body.fit_problem import FitProblem, Unknowns
+from hoigs.preparation.body.fitted import BodyErrors
 from hoigs.preparation.body.kinematics import JOINTS, PER_FRAME, NormalEquations
 from hoigs.preparation.body.landmarks import JOINTS as JOINT_OF
-
-if TYPE_CHECKING:
-    from hoigs.preparation.body.fit_problem import FitProblem, Unknowns
 
 DRAWS = 48
 SHOULDERS = [16, 17]  # body joints
 VISIBLE = 0.5
 SHARE = 0.8  # of the frames, in which the body is to be within its errors
-# factor with which the errors hold, as a network's landmarks are off alike over whole clips, which
-# the fit takes for noise (benchmarks/landmark_errors.py, real.py and end_to_end.py)
-ALIKE = 1.8
-
-
-@dataclass(frozen=True)
-class BodyErrors:
-    """Within which a body is in four of five frames, metres.
-
-    Attributes:
-        joints: mean distance of the seen joints from the true ones, both about the middle of the
-            shoulders. distance: of that middle along the camera's axis.
-    """
-
-    joints: Float[Tensor, " F"]
-    distance: Float[Tensor, " F"]
-
-    def rows(self, frames: slice) -> BodyErrors:
-        """Of some frames alone."""
-        return BodyErrors(self.joints[frames], self.distance[frames])
-
-    @staticmethod
-    def joined(parts: Sequence[BodyErrors]) -> BodyErrors:
-        """Of the frames of all parts, in order."""
-        return BodyErrors(
-            torch.cat([part.joints for part in parts]),
-            torch.cat([part.distance for part in parts]),
-        )
+# factors of joints and distance with which these errors hold: a network's landmarks are off alike
+# over whole clips, which the fit takes for noise (benchmarks/real.py, end_to_end.py)
+ALIKE = (2.0, 1.6)
 
 
 def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyErrors:
@@ -73,8 +44,8 @@ def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyE
         distances.append((at - best)[:, SHOULDERS, 2].mean(1).abs())
         off = (_about_shoulders(at) - _about_shoulders(best)).norm(dim=-1)
         joints.append((off * seen).sum(1) / seen.sum(1))
-    within = [ALIKE * torch.stack(found).quantile(SHARE, 0) for found in (joints, distances)]
-    return BodyErrors(*(errors.float() for errors in within))
+    within = (torch.stack(found).quantile(SHARE, 0).float() for found in (joints, distances))
+    return BodyErrors(*(factor * errors for factor, errors in zip(ALIKE, within, strict=True)))
 
 
 def _seen(problem: FitProblem) -> Float[Tensor, "F 22"]:

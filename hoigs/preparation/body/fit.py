@@ -15,16 +15,15 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.errors import BodyErrors, body_errors
+from hoigs.preparation.body.errors import body_errors
 from hoigs.preparation.body.fit_problem import (
-    BodyFit,
     FitOptions,
     FitProblem,
     Found,
-    Joint,
     Observations,
     Unknowns,
 )
+from hoigs.preparation.body.fitted import BodyErrors, BodyFit, Joint
 from hoigs.preparation.body.kinematics import PER_FRAME, REACH, NormalEquations, nearest_turn
 from hoigs.preparation.body.landmarks import ENOUGH
 from hoigs.preparation.body.start import first_guess

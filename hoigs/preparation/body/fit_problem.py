@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,8 +14,8 @@ from hoigs.core.interfaces.body import BodyModel
 from hoigs.core.maths.rotations import axis_angle_to_quats, multiply_quats, quats_to_axis_angle
 from hoigs.core.values.camera import Camera, pinhole_pixels
 from hoigs.core.values.moment import BodyPose
-from hoigs.preparation.body.errors import BodyErrors
 from hoigs.preparation.body.face import Size, faces_of
+from hoigs.preparation.body.fitted import BodyErrors, BodyFit
 from hoigs.preparation.body.kinematics import (
     REACH,
     Kinematics,
@@ -107,42 +106,6 @@ class Observations:
             turns=None if self.turns is None else self.turns[frames],
             masks=None,
         )
-
-
-@dataclass(frozen=True)
-class BodyFit:
-    """A fitted body.
-
-    Attributes:
-        poses: batched over the frames, in a world of metres.
-        residual_px: mean distance of visible landmarks per frame, pixels; NaN where unseen.
-        scene_scale: metres a unit of the cameras' own world (1 unless it was requested).
-        report: numbers for people.
-        errors: within which the poses are.
-        joints: of a fit in windows, where one follows another.
-    """
-
-    poses: BodyPose
-    residual_px: Float[Tensor, " F"]
-    scene_scale: float
-    report: dict[str, Any]
-    errors: BodyErrors
-    joints: tuple[Joint, ...] = ()
-
-
-@dataclass(frozen=True)
-class Joint:
-    """Where a window takes over from the one before it, and how far both are apart there.
-
-    Attributes:
-        frame: the first that is the later window's own.
-        metres, degrees: largest distance of a joint's places, and angle between its orientations in
-            the world, by the two windows.
-    """
-
-    frame: int
-    metres: float
-    degrees: float
 
 
 @dataclass(frozen=True)

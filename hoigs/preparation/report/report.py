@@ -308,7 +308,7 @@ def _in_space(report: Measures) -> Iterator[MeasureDiagnostic]:
             f"± {1000 * off:.0f} mm",
             "those that are seen, about the shoulders, on average in four of five frames; "
             f"± {1000 * worst:.0f} mm in the worst twentieth of them",
-            _judge(off, 0.05, 0.1),
+            _judge(off, 0.05, 0.15),
             "limbs that point to the camera or away from it are known least: judge the body from "
             "other sides than the camera's, and film with a camera that moves around the person",
         )
@@ -317,9 +317,9 @@ def _in_space(report: Measures) -> Iterator[MeasureDiagnostic]:
         yield _judged(
             f"distance of {name}",
             f"± {100 * share:.0f} %",
-            f"{100 * share * within.away:.0f} cm, as the body's size, which is {within.size_from}"
-            f"{legs}",
-            _judge(share, 0.05, 0.1),
+            f"{100 * share * within.away:.0f} cm; it follows from the body's size, which is "
+            f"{within.size_from}{legs}",
+            _judge(share, 0.05, 0.15),
             "give --person-height, if you know it",
         )
 

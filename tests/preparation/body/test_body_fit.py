@@ -23,13 +23,13 @@ from hoigs.core.values.moment import BodyPose
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.fit import fit_body
 from hoigs.preparation.body.fit_problem import (
-    BodyFit,
     FitOptions,
     FitProblem,
     Observations,
     Unknowns,
     ground_scale,
 )
+from hoigs.preparation.body.fitted import BodyFit
 from hoigs.preparation.body.kinematics import NormalEquations
 from hoigs.preparation.body.landmarks import FrameFates, Landmarks, points_of
 from hoigs.preparation.body.priors import beyond

@@ -18,7 +18,8 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit, Observations
+from hoigs.preparation.body.fit_problem import Observations
+from hoigs.preparation.body.fitted import BodyFit
 from hoigs.preparation.body.landmarks import ENOUGH, SOLID, USED, Landmarks
 from hoigs.preparation.body.start import flat_start, place, relaxed
 

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body
-from hoigs.preparation.body.fit_problem import BodyFit, Observations
+from hoigs.preparation.body.fit_problem import Observations
+from hoigs.preparation.body.fitted import BodyFit
 from hoigs.preparation.body.kinematics import PER_FRAME, NormalEquations
 from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.body.mask_fit import MaskFit, posed, silhouette

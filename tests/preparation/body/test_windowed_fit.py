@@ -14,7 +14,8 @@ from hoigs.core.maths.frame_times import Chunking
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.fit import fit_body, spread
-from hoigs.preparation.body.fit_problem import BodyFit, FitOptions, Observations
+from hoigs.preparation.body.fit_problem import FitOptions, Observations
+from hoigs.preparation.body.fitted import BodyFit
 from hoigs.preparation.body.kinematics import NormalEquations
 from hoigs.preparation.body.landmarks import Landmarks
 

@@ -63,6 +63,8 @@ class GuidedPose:
 
     def __init__(self, graph, rect, check) -> None:
         self.graph, self.rect, self.check = graph, rect, check
+        self.shoulders: Any = None  # where they were last, pixels; and their middle at the square
+        self.placed: Any = None
         self.square: Any = None  # x, y of the middle and side, pixels
         self.around = AROUND[0]  # which of the squares about it showed the person last
         self.broad = 0.0  # distance of the shoulders when the person was found, pixels

@@ -146,7 +146,8 @@ class Finder:
 
     def look_back(self):
         """Whoever was found without the detector, late or again, in the frames before."""
-        last, shown = self.last, []
+        last = self.last
+        shown: list[Any] = []
 
         def frames():
             for place, encoded in reversed(self.unseen):
@@ -157,7 +158,7 @@ class Finder:
 
         for found in self.guided.earlier(frames()):
             self.alone[shown[0]] = False
-            self.keep(*shown, found)
+            self.keep(shown[0], shown[1], shown[2], found)
         self.last = last
 
     def keep(self, place, image, wide, found):
