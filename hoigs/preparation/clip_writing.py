@@ -251,8 +251,9 @@ def errors_of(made: MadeObject, cameras: Sequence[Camera]) -> tuple[float | None
     """Metres by which an object's place is off, and degrees by which its turn is, typically.
 
     Across the picture it is off by as much as its outline is, and in depth by as much as its size
-    seems to change. A turn that moves its surface by what the outline is off cannot be told; it is
-    not known at all where no texture shows it.
+    seems to change. A turn out of the picture changes the outline to second order only: one that
+    moves it by less than it is off, r (1 - cos a), cannot be told. It is not known at all where no
+    texture shows it.
     """
     track, known = made.track, made.confidence.outline[np.isfinite(made.confidence.outline)]
     seen = track.observed.nonzero().flatten().tolist()
@@ -264,7 +265,7 @@ def errors_of(made: MadeObject, cameras: Sequence[Camera]) -> tuple[float | None
     if made.confidence.way != "texture and hands":
         return place, None
     radius = float(track.points.norm(dim=-1).mean())
-    return place, math.degrees(math.atan2(outline, radius))
+    return place, math.degrees(math.acos(max(0.0, 1 - outline / radius)))
 
 
 def _metres_off(person: Body, cameras: Sequence[Camera]) -> float:

@@ -29,7 +29,6 @@ from hoigs.preparation.objects.filmed import Filmed
 MARGIN = 1.6  # side of a crop over the longer side of the mask's box
 EDGES = 96  # pixels of the outline that a crop keeps
 LIMB, NEAR = 0.08, 0.05  # metres: about a limb's bone, and in front of the camera
-BEHIND_THEM = 0.2  # what a pixel costs there that may be hidden, of one that shows the background
 DARK = 0.05  # added before logarithms of brightness
 
 
@@ -159,10 +158,7 @@ def make_crops(
         rows["view"].append(cameras[i].world_to_camera.double().numpy())
         rows["mask"].append(mask)
         rows["hidden"].append(hidden | ~inside)
-        beyond = ndimage.distance_transform_edt(~(mask | hidden) & inside)
-        rows["outside"].append(
-            beyond + BEHIND_THEM * ndimage.distance_transform_edt(~mask & inside)
-        )
+        rows["outside"].append(ndimage.distance_transform_edt(~(mask | hidden) & inside))
         rows["edges"].append(edges)
         rows["share"].append(np.array(share))
     stacks = {name: torch.from_numpy(np.stack(v)).float() for name, v in rows.items()}

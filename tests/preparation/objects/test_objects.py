@@ -10,7 +10,7 @@ import torch
 
 from hoigs.core.interfaces.body import LEFT_WRIST, RIGHT_WRIST
 from hoigs.core.values.camera import Camera
-from hoigs.preparation.mask_stack import MaskStack, long_axis, outlines_of
+from hoigs.preparation.mask_stack import MaskStack, outlines_of
 from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.registered import registered
 from hoigs.preparation.objects.shape import (
@@ -208,16 +208,8 @@ def test_crumbs_are_no_observation_and_cut_masks_have_no_length() -> None:
     assert outlines.observed.tolist() == [True, False, True, True]
     assert outlines.whole.tolist() == [True, False, False, True]
     assert np.isfinite(outlines.lengths).tolist() == [True, False, False, True]
-    assert np.isnan(outlines.angles).all(), "a square has no long axis"
     assert outlines.lengths[0] == pytest.approx(4 * 20 / np.sqrt(12), rel=0.01)
     np.testing.assert_allclose(outlines.centers[:2], [[40, 30], [53.0, 30]], atol=2.5)
-
-
-def test_long_axis_directions() -> None:
-    x = np.linspace(-10, 10, 50)
-    for angle in (-1.2, 0.0, 0.8, np.pi / 2):
-        line = np.stack((x * np.cos(angle), x * np.sin(angle)), 1)
-        assert long_axis(line)[1] == pytest.approx(angle, abs=1e-6)
 
 
 def test_apparent_size_is_the_median_over_whole_masks() -> None:

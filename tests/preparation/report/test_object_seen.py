@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+import pytest
+import torch
 from test_prepare_report import report
 
+from hoigs.core.values.camera import Camera
+from hoigs.core.values.clip import ObjectTrack
+from hoigs.preparation.clip_writing import errors_of
+from hoigs.preparation.objects.make_object import MadeObject
+from hoigs.preparation.objects.tracked import ObjectConfidence
 from hoigs.preparation.report.object_seen import ObjectSeen, best_click, by_state
 
 STATES = ["seen"] * 3 + ["lost"] * 2 + ["seen"] + ["lost"] * 3 + ["hidden by a person"]
@@ -37,3 +45,17 @@ def test_an_object_that_is_seen_in_few_frames_is_bad_and_its_other_frames_are_na
         d for d in replace(made, objects_seen={"club": whole}).diagnostics() if "club" in d.kind
     ]
     assert one.severity == "good" and not one.do
+
+
+@pytest.mark.parametrize("way", ["texture and hands", "outline"])
+def test_a_turn_that_the_outline_hides_is_within_the_error(way: str) -> None:
+    """The outline is off by what a turn of 15 degrees out of the picture moves it."""
+    points = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1) * 0.2
+    turns, places = torch.eye(3).expand(4, 3, 3), torch.tensor([0.0, 0, 2]).expand(4, 3)
+    track = ObjectTrack(points, points * 0, turns, places, torch.ones(4, dtype=torch.bool))
+    outline = np.full(4, 0.2 * (1 - np.cos(np.radians(15))))
+    made = MadeObject(track, 0.01, ObjectConfidence(way, outline, outline), np.ones(4))
+    camera = Camera(torch.tensor([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]]), torch.eye(4), 80, 60)
+    place, turn = errors_of(made, [camera] * 4)
+    assert place is not None and place > 0.02
+    assert turn is None if way == "outline" else turn == pytest.approx(15, abs=0.5)

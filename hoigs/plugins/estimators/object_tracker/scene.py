@@ -15,6 +15,7 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 # How the picture of the scene moves between frames: homographies, from matched blocks.
 
 STILL = 0.35  # pixels between frames below which a camera counts as static
+ALWAYS = 0.95  # of the frames, in which a border that belongs to the video is black
 BLOCK = 48
 
 
@@ -28,7 +29,9 @@ def homographies(footage: Footage) -> Float[np.ndarray, "F 3 3"]:
 
 
 def is_static(footage: Footage, samples: int = 16) -> bool:
-    """Whether the picture of the scene stays where it is, by blocks of frames across the video."""
+    """Whether the picture of the scene stays where it is, by blocks of frames across the video. A
+    black border that comes and goes is that of a video which was stabilised; one that stays is a
+    letterbox."""
     picks = np.unique(np.linspace(0, len(footage) - 1, samples).astype(int))
     moved = []
     for a, b in pairwise(picks):
@@ -38,7 +41,8 @@ def is_static(footage: Footage, samples: int = 16) -> bool:
             order = np.hypot(*shift.T).argsort()
             share = weight[order].cumsum() / weight.sum()
             moved.append(np.hypot(*shift.T)[order][np.searchsorted(share, 0.5)])
-    return bool(moved) and float(np.median(moved)) < 2 * STILL and not footage.blank.any()
+    comes = (footage.blank.any(0) & (footage.blank.mean(0) < ALWAYS)).any()
+    return bool(moved) and float(np.median(moved)) < 2 * STILL and not comes
 
 
 def chained(steps: Float[np.ndarray, "F 3 3"], a: int, b: int) -> Float[np.ndarray, "3 3"]:

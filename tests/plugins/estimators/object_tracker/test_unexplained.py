@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from disc_world import H, W, texture
 from test_behind import footage_of
 
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.scene import static_scene
+from hoigs.plugins.estimators.object_tracker.scene import is_static, static_scene
 from hoigs.plugins.estimators.object_tracker.unexplained import completed
 
 COUNT, CLICKED = 24, 3
@@ -67,3 +69,13 @@ def test_of_two_rods_that_may_be_it_none_is_taken() -> None:
     found = completed(footage, static_scene(footage), [prompt], track)
     for mask, theirs in zip(found.soft > 127, other, strict=True):
         assert not (mask & theirs).sum() > 0.5 * mask.sum() or not mask.any()
+
+
+def test_a_letterbox_is_no_border_of_a_stabilised_video() -> None:
+    frames, people, _ = swung()
+    footage = footage_of(frames, people)
+    bars = np.zeros_like(footage.blank)
+    bars[:, :6] = True
+    assert is_static(footage) and is_static(replace(footage, blank=bars))
+    bars[COUNT // 2 :] = False
+    assert not is_static(replace(footage, blank=bars))
