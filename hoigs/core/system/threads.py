@@ -248,3 +248,17 @@ def keep_freed_memory() -> bool:
         return False
     wanted = {M_MMAP_THRESHOLD: LARGEST_IN_HEAP, M_TRIM_THRESHOLD: KEPT, M_TOP_PAD: STEP}
     return all(library.mallopt(parameter, value) == 1 for parameter, value in wanted.items())
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Of torch: with a few thousand numbers at a time, threads wait for each other longer than
+    they compute, and a hundred times as long where other programs run."""
+    import torch  # on use: the command line sets its threads before it is loaded
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

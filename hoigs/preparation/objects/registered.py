@@ -18,6 +18,7 @@ from PIL import Image
 from scipy import ndimage
 from torch import Tensor
 
+from hoigs.core.system.threads import one_thread
 from hoigs.preparation.mask_stack import Outlines
 from hoigs.preparation.objects.filmed import Filmed
 
@@ -47,6 +48,7 @@ class Registered:
     overlaps: Float[np.ndarray, " F"]
 
 
+@one_thread()
 def registered(filmed: Filmed, outlines: Outlines) -> Registered:
     """Every frame that shows the object against the one that shows most of it: the largest mask
     that the border does not cut, or one twice as large that it does."""

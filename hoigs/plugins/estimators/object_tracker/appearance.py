@@ -9,7 +9,6 @@ Since these are few, it also learns from pictures of them that are turned, scale
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +18,7 @@ from scipy import ndimage
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from hoigs.core.system.threads import one_thread
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 
 DIRECTIONS = 8
@@ -31,18 +31,6 @@ RATE = 0.01
 HIDDEN = 48
 LIMIT = 4.0  # largest log-odds
 UNITS = (8.0, 3.0)  # of colours and of edges, so that both are of order one
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Of torch: with a few thousand numbers at a time, threads wait for each other longer than
-    they compute, and a hundred times as long where other programs run."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def cell_features(colors: Float[np.ndarray, "h w 3"], side: int) -> Float[Tensor, "C r c"]:

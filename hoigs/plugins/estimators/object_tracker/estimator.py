@@ -22,8 +22,8 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
 )
 from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.system.threads import one_thread
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
-from hoigs.plugins.estimators.object_tracker.appearance import one_thread
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage, skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
