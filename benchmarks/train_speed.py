@@ -19,8 +19,8 @@ spends in each part meanwhile; `waited_ms`, from other steps, has the device fin
 the next. Operations are those that a dispatch mode sees in a step, views apart; the profiler counts
 launches, on CUDA.
 
-`--graphs` is `train.graphs`; "both" measures first without CUDA graphs, then with those of the scene
-alone, then with those of whole steps, on one model; `loss` is then all of a step's replay.
+`--graphs` is `train.graphs`; "both" measures first without CUDA graphs, then with those of the
+scene alone, then with those of whole steps, on one model; `loss` is then all of a step's replay.
 """
 
 from __future__ import annotations
