@@ -13,7 +13,8 @@ import torch
 import hoigs as h
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.model.compose import compose_objectives
-from hoigs.core.registry.registry import default_registry
+from hoigs.core.registry.manager import PluginManager
+from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.schema import Spec
 from hoigs.testing import decoder, deformation
 from hoigs.testing.checks import run_checks
@@ -22,7 +23,18 @@ from hoigs.testing.runner import Options
 
 PAPERS = Path(__file__).parents[1] / "examples" / "papers"
 STG, SOM = PAPERS / "spacetime_gaussians.py", PAPERS / "shape_of_motion.py"
-REGISTRY = default_registry(plugin_files=[STG, SOM])
+
+
+def _registry() -> Registry:
+    """One of its own: what a user's file adds to that of the process stays there."""
+    manager = PluginManager()
+    manager.load_installed()
+    for path in (STG, SOM):
+        manager.load_file(path)
+    return Registry(manager)
+
+
+REGISTRY = _registry()
 
 
 @pytest.mark.parametrize("file", [STG, SOM], ids=lambda file: file.stem)
