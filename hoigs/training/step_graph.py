@@ -163,6 +163,7 @@ class StepGradients:
             if self._memory is None or not self._memory.fits(self._key, self._least):
                 self._memory = ViewMemory(view, self._key, self._least, self._model)
             self._memory.fill(view, backgrounds)
+            drawn = self._model.rasterizer.graph_memory(self._model.device)
             made = _CapturedStep(self._step, self._memory, self._stream)
             failure = None
             if self._key.structure not in self._compared:
@@ -172,7 +173,7 @@ class StepGradients:
         if failure is None:
             self._captured = made
             self._compared.add(self._key.structure)
-            made.drawn = self._model.rasterizer.graph_memory(self._model.device)
+            made.drawn = drawn
             self.captures += 1
             return
         self.mode, self.reason = "plain", failure
@@ -376,7 +377,7 @@ class _CapturedStep:
         stream: to capture on; None launches kernel by kernel, the same in every other respect.
 
     Attributes:
-        drawn: the rasterizer's `graph_memory` when it was captured.
+        drawn: the rasterizer's `graph_memory` before it was captured.
     """
 
     drawn = 0
