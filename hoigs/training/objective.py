@@ -32,6 +32,7 @@ from hoigs.training.views import TrainingView
 
 RESIDUAL_PENALTIES = ("residual_pose", "residual_means")  # on corrections by the interaction
 Part = tuple[RenderOutput | None, dict[str, Tensor], dict[str, float]]  # with terms and weights
+WHOLE = ""  # what is of no entity: no name is empty
 CAMERA_WEIGHT = 0.1  # of camera corrections; moving all cameras and the scene changes no image
 
 
@@ -178,9 +179,9 @@ class JointObjective:
             n: partial(self._of_entity, n, view, camera, state, deformed.penalties, backgrounds)
             for n in trained
         }
-        own["composite"] = partial(self._of_composite, view, camera, state, request)
+        own[WHOLE] = partial(self._of_composite, view, camera, state, request)
         found = apart(own, (state, camera, view, backgrounds, request))
-        composite, terms, weights = found["composite"]
+        composite, terms, weights = found[WHOLE]
         assert composite is not None
         for name in trained:
             _, own_terms, own_weights = found[name]
