@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -187,7 +188,7 @@ def fit_person(
     for i, (vertices, at) in enumerate(posed(body, fit.poses)):
         joints[i], lowest[i] = at, vertices[:, 1].max()
     residual = float(fit.residual_px.nanmedian())
-    unseen, about = unseen_parts(landmarks), float(fit.errors.joints.median())
+    unseen = unseen_parts(landmarks)
     found, solid = int(landmarks.found.sum()), int(landmarks.solid.sum())
     return Body(
         poses=fit.poses,
@@ -202,9 +203,8 @@ def fit_person(
         provenance=(
             f"fitted to {landmarks.source} landmarks{'' if solid else ' in the image only'} of "
             f"{found} of {len(cameras)} frames{'' if seen.masks is None else ' and to masks'}, "
-            f"{residual:.1f} px off (median of frames); {_size(fit.report, stature(body))}; its "
-            f"joints about the shoulders are right to {1000 * about:.0f} mm in four of five "
-            "frames; hands are not fitted"
+            f"{residual:.1f} px off (median of frames); {_size(fit.report, stature(body))}; "
+            f"{_within(fit.errors)}; hands are not fitted"
             f"{'' if chunking is None else _windows(fit.joints, chunking)}"
         ),
         report=fit.report,
@@ -286,6 +286,13 @@ def _warnings(residual: float, found: int, solid: int, cameras: Sequence[Camera]
     if residual > POOR_FIT * max(cameras[0].width, cameras[0].height):
         warnings.append(f"the body misses its landmarks by {residual:.1f} px: see overlay.mp4")
     return warnings
+
+
+def _within(errors: BodyErrors) -> str:
+    off = float(errors.joints.nanmedian())
+    if math.isnan(off):
+        return "how far its joints are off is not known"
+    return f"its joints about the shoulders are right to {1000 * off:.0f} mm in four of five frames"
 
 
 def unseen_parts(landmarks: Landmarks) -> list[str]:

@@ -238,6 +238,25 @@ Mode = Literal["graph", "cached", "plain"]
 TOLERANCE = 2e-3
 
 
+def mode_of(
+    graphs: Graphs, unsafe: str | None, device: torch.device, kernel_by_kernel: bool
+) -> tuple[Mode, str]:
+    """How steps run, and why.
+
+    Args:
+        unsafe: why a graph cannot hold them; None if it can.
+    """
+    if graphs == "off":
+        return "plain", "train.graphs is off"
+    if unsafe is not None:
+        return "plain", unsafe
+    if kernel_by_kernel:
+        return "cached", "kernel_by_kernel is set"
+    if device.type != "cuda":
+        return "plain", f"CUDA graphs need a CUDA device, the model is on {device}"
+    return "graph", "every component is cuda_graph_safe"
+
+
 @dataclass(frozen=True)
 class Deformed:
     """The scene at a moment.
@@ -297,21 +316,10 @@ class GraphedScene:
         self._compared: set[object] = set()
         self._stream: torch.cuda.Stream | None = None
         self.captures = 0
-        self.mode, self.reason = self._choose(graphs, kernel_by_kernel)
+        unsafe = why_not_cuda_graph_safe(components_of(model))
+        self.mode, self.reason = mode_of(graphs, unsafe, model.device, kernel_by_kernel)
         if self._required and self.mode == "plain":
             raise HoigsError(f"train.graphs is on, but {self.reason}; set it to auto or off")
-
-    def _choose(self, graphs: Graphs, kernel_by_kernel: bool) -> tuple[Mode, str]:
-        if graphs == "off":
-            return "plain", "train.graphs is off"
-        unsafe = why_not_cuda_graph_safe(components_of(self._model))
-        if unsafe is not None:
-            return "plain", unsafe
-        if kernel_by_kernel:
-            return "cached", "kernel_by_kernel is set"
-        if self._model.device.type != "cuda":
-            return "plain", f"CUDA graphs need a CUDA device, the model is on {self._model.device}"
-        return "graph", "every component is cuda_graph_safe"
 
     def __call__(self, moment: Moment) -> Deformed:
         """The scene at a moment; one on the CPU is fastest, since graphs copy it from there."""

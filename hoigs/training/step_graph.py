@@ -23,10 +23,10 @@ from hoigs.core.values.clip import Frame
 from hoigs.training.graphs import (
     Deformed,
     GraphKey,
-    Mode,
     components_of,
     first_difference,
     leaves_of,
+    mode_of,
     root_cause,
 )
 from hoigs.training.losses import Crop
@@ -70,19 +70,8 @@ class StepGradients:
         self._stream: torch.cuda.Stream | None = None
         self._least = _Needs()
         self.captures = 0
-        self.mode, self.reason = self._choose(graphs, kernel_by_kernel)
-
-    def _choose(self, graphs: Graphs, kernel_by_kernel: bool) -> tuple[Mode, str]:
-        if graphs == "off":
-            return "plain", "train.graphs is off"
-        unsafe = why_not_whole(self._objective)
-        if unsafe is not None:
-            return "plain", unsafe
-        if kernel_by_kernel:
-            return "cached", "kernel_by_kernel is set"
-        if self._model.device.type != "cuda":
-            return "plain", f"CUDA graphs need a CUDA device, the model is on {self._model.device}"
-        return "graph", "every component is cuda_graph_safe"
+        unsafe, device = why_not_whole(objective), self._model.device
+        self.mode, self.reason = mode_of(graphs, unsafe, device, kernel_by_kernel)
 
     def __call__(
         self, view: TrainingView, camera: Camera, generator: torch.Generator
@@ -169,6 +158,7 @@ class StepGradients:
             if self._key.structure not in self._compared:
                 failure = self._difference(made, view)
         except (RuntimeError, TypeError, ValueError, NotImplementedError, PluginError) as error:
+            # what CUDA or a component raises when it is captured; reported below
             failure = root_cause(error)
         if failure is None:
             self._captured = made

@@ -21,6 +21,21 @@ from hoigs.core.system.quiet_warp import wp
 
 LANES = 16
 CHUNK = 512  # points
+# From a coordinate in [-1, 1] to the cell before it, how far behind that it is, and the derivative
+# of the place, in cells, by the coordinate.
+AXIS = r"""
+    auto axis = [](float u, int cells, float& f, float& slope) -> int {
+        const float share = (u + 1.0f) / 2.0f;
+        const float size = (float)(cells - 1);
+        slope = share >= 0.0f && share <= 1.0f ? size / 2.0f : 0.0f;
+        const float at = (share < 0.0f ? 0.0f : share > 1.0f ? 1.0f : share) * size;
+        // comparisons with NaN are false: it reads the last cell, and f is NaN
+        float corner = at < size - 1.0f ? $FLOOR(at) : size - 1.0f;
+        corner = corner > 0.0f ? corner : 0.0f;
+        f = at - corner;
+        return (int)corner;
+    };
+"""
 _CELL = r"""
     constexpr int LANES = $LANES, CHUNK = $CHUNK;
     typedef float vec __attribute__((vector_size(4 * LANES)));
@@ -35,18 +50,7 @@ _CELL = r"""
         int first;  // the corner's first channel
         float fx, fy, slope_x, slope_y;
     };
-    auto axis = [](float u, int cells, float& f, float& slope) -> int {
-        const float share = (u + 1.0f) / 2.0f;
-        const float size = (float)(cells - 1);
-        slope = share >= 0.0f && share <= 1.0f ? size / 2.0f : 0.0f;
-        const float at = (share < 0.0f ? 0.0f : share > 1.0f ? 1.0f : share) * size;
-        // comparisons with NaN are false: it reads the last cell, and f is NaN
-        float corner = at < size - 1.0f ? __builtin_floorf(at) : size - 1.0f;
-        corner = corner > 0.0f ? corner : 0.0f;
-        f = at - corner;
-        return (int)corner;
-    };
-    auto cell_of = [&](int plane, int point) -> Cell {
+$AXIS    auto cell_of = [&](int plane, int point) -> Cell {
         const float* at = points_ + 2 * ((long long)plane * count + point);
         Cell cell;
         const int x = axis(at[0], width, cell.fx, cell.slope_x);
@@ -151,7 +155,8 @@ _BACKWARD = r"""
 
 
 def _source(body: str) -> str:
-    whole = _CELL.replace("$BODY", body)
+    axis = AXIS.replace("$FLOOR", "__builtin_floorf")
+    whole = _CELL.replace("$AXIS", axis).replace("$BODY", body)
     return whole.replace("$LANES", str(LANES)).replace("$CHUNK", str(CHUNK))
 
 

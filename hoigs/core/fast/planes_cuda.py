@@ -9,6 +9,7 @@ from torch import Tensor
 
 from hoigs.core.fast.cuda_launch import CudaStreams
 from hoigs.core.fast.launch import CPU_FLAGS, prepared
+from hoigs.core.fast.planes import AXIS
 from hoigs.core.first_order import IN_TORCH, first_order
 from hoigs.core.system.quiet_warp import wp
 
@@ -26,18 +27,7 @@ _CELL = r"""
     // on a plane that is one cell wide or high, the neighbour is the cell itself
     const long long right = width > 1 ? channels : 0;
     const long long below = height > 1 ? (long long)width * channels : 0;
-    auto axis = [](float u, int cells, float& f, float& slope) -> int {
-        const float share = (u + 1.0f) / 2.0f;
-        const float size = (float)(cells - 1);
-        slope = share >= 0.0f && share <= 1.0f ? size / 2.0f : 0.0f;
-        const float at = (share < 0.0f ? 0.0f : share > 1.0f ? 1.0f : share) * size;
-        // comparisons with NaN are false: it reads the last cell, and f is NaN
-        float corner = at < size - 1.0f ? floorf(at) : size - 1.0f;
-        corner = corner > 0.0f ? corner : 0.0f;
-        f = at - corner;
-        return (int)corner;
-    };
-    auto cell_of = [&](int plane, int point) -> Cell {
+$AXIS    auto cell_of = [&](int plane, int point) -> Cell {
         const float* at = (const float*)points.data + 2 * ((long long)plane * count + point);
         Cell cell;
         const int x = axis(at[0], width, cell.fx, cell.slope_x);
@@ -45,7 +35,7 @@ _CELL = r"""
         cell.first = (((long long)plane * height + y) * width + x) * channels;
         return cell;
     };
-"""
+""".replace("$AXIS", AXIS.replace("$FLOOR", "floorf"))
 _FORWARD = r"""
     const int channel = item % channels, plane = item / channels % many;
     const Cell cell = cell_of(plane, item / channels / many);

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -28,6 +29,8 @@ def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyE
     The size of the body, which the fit takes for all but known, is drawn beside it: a larger body
     that is farther off by as much is seen alike. The scale of the cameras' world is not.
 
+    Where the fit's equations do not say how far each number may be off, the errors are NaN.
+
     Args:
         spread: standard deviation of the logarithm of the body's size.
     """
@@ -37,13 +40,16 @@ def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyE
     generator = torch.Generator().manual_seed(0)
     best, seen = problem.joints(unknowns), _seen(problem)
     joints, distances = [], []
-    for own, shared in equations.draws(DRAWS, generator):
-        shared[-1:] = 0  # the scale: one that nothing shows would be drawn from everywhere
-        size = math.exp(spread * float(torch.randn((), generator=generator)))
-        at = size * problem.joints(unknowns.moved(own, shared))
-        distances.append((at - best)[:, SHOULDERS, 2].mean(1).abs())
-        off = (_about_shoulders(at) - _about_shoulders(best)).norm(dim=-1)
-        joints.append((off * seen).sum(1) / seen.sum(1))
+    try:
+        for own, shared in equations.draws(DRAWS, generator):
+            shared[-1:] = 0  # the scale: one that nothing shows would be drawn from everywhere
+            size = math.exp(spread * float(torch.randn((), generator=generator)))
+            at = size * problem.joints(unknowns.moved(own, shared))
+            distances.append((at - best)[:, SHOULDERS, 2].mean(1).abs())
+            off = (_about_shoulders(at) - _about_shoulders(best)).norm(dim=-1)
+            joints.append((off * seen).sum(1) / seen.sum(1))
+    except (np.linalg.LinAlgError, torch.linalg.LinAlgError):  # not positive definite
+        return BodyErrors.unknown(frames)
     within = (torch.stack(found).quantile(SHARE, 0).float() for found in (joints, distances))
     return BodyErrors(*(factor * errors for factor, errors in zip(ALIKE, within, strict=True)))
 

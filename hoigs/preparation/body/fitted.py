@@ -15,7 +15,7 @@ from hoigs.core.values.moment import BodyPose
 
 @dataclass(frozen=True)
 class BodyErrors:
-    """Within which a body is in four of five frames, metres.
+    """Within which a body is in four of five frames, metres; NaN where that is not known.
 
     Attributes:
         joints: mean distance of the seen joints from the true ones, both about the middle of the
@@ -24,6 +24,11 @@ class BodyErrors:
 
     joints: Float[Tensor, " F"]
     distance: Float[Tensor, " F"]
+
+    @staticmethod
+    def unknown(frames: int) -> BodyErrors:
+        """Of a body of which nothing tells them."""
+        return BodyErrors(torch.full((frames,), torch.nan), torch.full((frames,), torch.nan))
 
     def rows(self, frames: slice) -> BodyErrors:
         """Of some frames alone."""

@@ -299,7 +299,7 @@ class NormalEquations:
         unknowns (Rue and Held 2005, algorithm 2.4, with the border's by its Schur complement).
 
         Raises:
-            LinAlgError: H is not positive definite.
+            LinAlgError: numpy's or torch's: H is not positive definite.
         """
         frames, width = self.by_frame.shape
         factor = cholesky_banded(self._band(0.0), overwrite_ab=True, check_finite=False)
@@ -313,7 +313,7 @@ class NormalEquations:
             own, _ = dtbtrs(factor, normal(frames * width, 1).numpy())
             shared = torch.linalg.solve_triangular(left.mT, normal(len(left), 1), upper=True)
             own = torch.from_numpy(own) - solved @ shared
-            yield own.unflatten(0, (frames, width))[..., 0].reshape(frames, width), shared[:, 0]
+            yield own.view(frames, width), shared[:, 0]
 
     def _band(self, damping: float) -> Float[np.ndarray, "K M"]:
         """Upper diagonals of the frames' part, as LAPACK stores them."""

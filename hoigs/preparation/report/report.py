@@ -24,7 +24,8 @@ class BodyWithin:
     """Within which a body is in four of five frames; of each frame, metres.
 
     Attributes:
-        joints: mean distance of the joints that are seen, about the middle of the shoulders.
+        joints: mean distance of the joints that are seen, about the middle of the shoulders; None
+            where it is not known.
         distance: of that middle from the camera. away: how far off the person is, median.
         size_from: how the body's size is known. unseen: parts that are hardly ever seen.
     """
@@ -302,6 +303,15 @@ def _in_space(report: Measures) -> Iterator[MeasureDiagnostic]:
     """How far each body may be off, which its landmarks in the image do not show."""
     low, high = report.focal_range or (1.0, 1.0)
     for name, within in report.bodies_within.items():
+        if all(v is None for v in within.joints):
+            yield _judged(
+                f"joints of {name}",
+                "not known",
+                "the fit's equations do not say how far each of its numbers may be off",
+                "bad",
+                "judge the body by overlay.mp4 and from other sides",
+            )
+            continue
         off, worst = _middle(within.joints, 0.5), _middle(within.joints, 0.95)
         yield _judged(
             f"joints of {name}",

@@ -117,6 +117,17 @@ def test_a_known_pose_is_found() -> None:
     assert (errors[:, 16:22].mean(1) < fit.errors.joints).all() and (fit.errors.joints < 0.4).all()
 
 
+def test_a_fit_whose_errors_nothing_tells_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: object) -> None:
+        raise torch.linalg.LinAlgError("the input is not positive-definite")
+
+    monkeypatch.setattr(NormalEquations, "draws", fail)
+    cameras = [camera()] * FRAMES
+    fit = fit_body(body(), Observations(seen_by(cameras, truth()), cameras), options=QUICK)
+    assert fit.residual_px.max() < 3.0
+    assert fit.errors.joints.isnan().all() and fit.errors.distance.isnan().all()
+
+
 def test_a_known_height_scales_the_body_and_its_distance() -> None:
     cameras, landmarks = [camera()] * FRAMES, seen_by([camera()] * FRAMES, truth())
     fit = fit_body(body(), Observations(landmarks, cameras), options=replace(QUICK, mean_size=0.92))

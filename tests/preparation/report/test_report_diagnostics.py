@@ -58,6 +58,13 @@ def test_a_body_is_said_to_be_as_far_off_as_it_may_be() -> None:
     assert {d.kind: d.severity for d in diagnose(wide)}["distance of ann"] == "bad"
 
 
+def test_a_body_of_unknown_error_is_said_to_be_one() -> None:
+    within = BodyWithin([None] * 4, [None] * 4, 2.0, "taken for the mean")
+    judged = diagnose(dataclasses.replace(report(), bodies_within={"ann": within}))
+    [joints] = [d for d in judged if d.kind == "joints of ann"]
+    assert (joints.value, joints.severity) == ("not known", "bad")
+
+
 def test_a_static_camera_is_not_asked_for_parallax() -> None:
     judged = states(displacement_px=0.13, focal_px=1024.0, focal_range=(0.75, 1.5))
     assert "parallax" not in judged and judged["camera"][0] == "fair"

@@ -16,7 +16,7 @@ from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import ObjectTrack
+from hoigs.core.values.clip import Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.deformation.articulated import Articulated
 from hoigs.plugins.deformation.chs import CubicHermite
@@ -105,6 +105,43 @@ def adaptive(motion: type[Keyframed], **settings: Any) -> Callable[..., Keyframe
 def cameras() -> list[Camera]:
     intrinsics = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 32.0], [0.0, 0.0, 1.0]])
     return [Camera(intrinsics, torch.eye(4), 64, 64)] * FRAMES
+
+
+class Noise(FrameStore):
+    """Square pictures of coloured noise."""
+
+    def __init__(self, side: int) -> None:
+        generator = torch.Generator().manual_seed(3)
+        self.images = torch.randint(0, 256, (FRAMES, side, side, 3), generator=generator)
+
+    def image(self, position: int) -> Tensor:
+        return self.images[position].to(torch.uint8)
+
+    def depth(self, position: int) -> Tensor | None:
+        return None
+
+
+def filmed(pictures: Noise, **settings: Any) -> Clip:
+    """A clip by a camera that moves past."""
+    side = pictures.images.shape[1]
+    views = [
+        Camera.look_at(
+            torch.tensor((0.2 * i - 0.5, 0.2, -2.5)), torch.tensor((0.0, 0.0, 0.5)),
+            width=side, height=side, fov_y=0.9, up=(0.0, -1.0, 0.0),
+        )
+        for i in range(FRAMES)
+    ]  # fmt: skip
+    return Clip(
+        "noise",
+        pictures,
+        views,
+        [at(f) for f in range(FRAMES)],
+        kinds={"human": "human", "object": "object"},
+        points=torch.rand(9, 3),
+        point_colors=torch.rand(9, 3),
+        split={"train": [0, 1, 3, 4], "test": [2, 5]},
+        **settings,
+    )
 
 
 def at(frame: float) -> Moment:

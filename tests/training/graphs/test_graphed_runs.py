@@ -9,12 +9,10 @@ from typing import Any
 import pytest
 import torch
 from emulated_graphs import emulate
-from graphed_cases import FRAMES, apart, at, gradients, loss, same_gradients, scene
+from graphed_cases import Noise, apart, at, filmed, gradients, loss, same_gradients, scene
 from torch import Tensor
 
 from hoigs.core.spec.train_schema import LossSpec, TrainSpec, WarmupSpec
-from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import Clip, FrameStore
 from hoigs.plugins.density.adc import AdaptiveDensity
 from hoigs.training.graphs import GraphedScene
 from hoigs.training.trainer import Trainer
@@ -25,15 +23,8 @@ SIZE, STEPS = 24, 30
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-class Pictures(FrameStore):
+class Pictures(Noise):
     """Coloured noise, and masks of the middle."""
-
-    def __init__(self) -> None:
-        generator = torch.Generator().manual_seed(3)
-        self.images = torch.randint(0, 256, (FRAMES, SIZE, SIZE, 3), generator=generator)
-
-    def image(self, position: int) -> Tensor:
-        return self.images[position].to(torch.uint8)
 
     def mask(self, entity: str, position: int) -> Tensor:
         mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
@@ -41,28 +32,8 @@ class Pictures(FrameStore):
         mask[6:18, 12:18] = entity == "object"
         return mask
 
-    def depth(self, position: int) -> Tensor | None:
-        return None
-
 
 def trainer(device: str = "cpu", graphs: Any = "auto", passes: int | None = None) -> Trainer:
-    cameras = [
-        Camera.look_at(
-            torch.tensor((0.2 * i - 0.5, 0.2, -2.5)), torch.tensor((0.0, 0.0, 0.5)),
-            width=SIZE, height=SIZE, fov_y=0.9, up=(0.0, -1.0, 0.0),
-        )
-        for i in range(FRAMES)
-    ]  # fmt: skip
-    clip = Clip(
-        "noise",
-        Pictures(),
-        cameras,
-        [at(f) for f in range(FRAMES)],
-        kinds={"human": "human", "object": "object"},
-        points=torch.rand(9, 3),
-        point_colors=torch.rand(9, 3),
-        split={"train": [0, 1, 3, 4], "test": [2, 5]},
-    )
     spec = TrainSpec(
         steps=STEPS,
         preview_every=0,
@@ -76,7 +47,7 @@ def trainer(device: str = "cpu", graphs: Any = "auto", passes: int | None = None
             AdaptiveDensity.Config(interval=8, stop=0.9, threshold=1e-9, cap=110)
         )
     }
-    return Trainer(scene().to(device), clip, spec, density=density)
+    return Trainer(scene().to(device), filmed(Pictures(SIZE)), spec, density=density)
 
 
 def without_capture(made: Trainer) -> Trainer:

@@ -7,12 +7,10 @@ from typing import Any
 
 import pytest
 import torch
-from graphed_cases import FRAMES, at, gradients, same_gradients, scene
+from graphed_cases import Noise, filmed, gradients, same_gradients, scene
 from torch import Tensor
 
 from hoigs.core.spec.train_schema import LossSpec, TrainSpec, WarmupSpec
-from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import Clip, FrameStore
 from hoigs.metrics.kernels.image_loss import Target, image_losses
 from hoigs.plugins.density.adc import AdaptiveDensity
 from hoigs.rasterizers.warp.rasterizer import WarpRasterizer
@@ -26,15 +24,8 @@ CUDA = pytest.param("cuda", marks=[pytest.mark.gpu, NO_CUDA])
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-class Pictures(FrameStore):
+class Pictures(Noise):
     """Noise; masks that move, one of them empty in a frame; depth and ignored pixels in some."""
-
-    def __init__(self) -> None:
-        generator = torch.Generator().manual_seed(3)
-        self.images = torch.randint(0, 256, (FRAMES, SIZE, SIZE, 3), generator=generator)
-
-    def image(self, position: int) -> Tensor:
-        return self.images[position].to(torch.uint8)
 
     def mask(self, entity: str, position: int) -> Tensor:
         mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
@@ -54,24 +45,6 @@ class Pictures(FrameStore):
 
 
 def trainer(device: str, graphs: Any, log_every: int = 50, **loss: Any) -> Trainer:
-    cameras = [
-        Camera.look_at(
-            torch.tensor((0.2 * i - 0.5, 0.2, -2.5)), torch.tensor((0.0, 0.0, 0.5)),
-            width=SIZE, height=SIZE, fov_y=0.9, up=(0.0, -1.0, 0.0),
-        )
-        for i in range(FRAMES)
-    ]  # fmt: skip
-    clip = Clip(
-        "noise",
-        Pictures(),
-        cameras,
-        [at(f) for f in range(FRAMES)],
-        kinds={"human": "human", "object": "object"},
-        points=torch.rand(9, 3),
-        point_colors=torch.rand(9, 3),
-        split={"train": [0, 1, 3, 4], "test": [2, 5]},
-        depth_kind="metric",
-    )
     spec = TrainSpec(
         steps=STEPS,
         preview_every=0,
@@ -86,7 +59,9 @@ def trainer(device: str, graphs: Any, log_every: int = 50, **loss: Any) -> Train
     density = {
         "scene": AdaptiveDensity(AdaptiveDensity.Config(interval=8, threshold=1e-9, cap=110))
     }
-    return Trainer(model.to(device), clip, spec, density=density)
+    return Trainer(
+        model.to(device), filmed(Pictures(SIZE), depth_kind="metric"), spec, density=density
+    )
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
