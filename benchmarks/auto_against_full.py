@@ -1,14 +1,14 @@
-"""Is `hoigs train --auto` as good as the whole spec, at a tenth of its parameters?
+"""Is `hoigs train --auto` as good as the whole spec, at a seventh of its parameters?
 
     python benchmarks/auto_against_full.py --jobs 6 --threads 8 --minutes 60
     python benchmarks/auto_against_full.py --clips lift-and-swing --steps 300 --width 64
 
 On each clip the whole spec is trained, and the spec that `--auto` finds. Auto passes where its PSNR
-of people and objects on test frames is within 0.15 dB of the whole spec's, with at most 10 % of its
-trained numbers and 50 % of its render time. The same command continues a run that was stopped;
-render times are measured at the end, when nothing else of this script runs, both models in turn: of
-films, which `Playback` draws (on CUDA by captured graphs), and for comparison of
-`SceneModel.render`, frame by frame, where a GPU mostly waits for launches.
+of people and objects, on test frames and from held-out cameras, is within 0.2 dB of the whole
+spec's, with at most 15 % of its trained numbers and 50 % of its render time. The same command
+continues a run that was stopped; render times are measured at the end, when nothing else of this
+script runs, both models in turn: of films, which `Playback` draws (on CUDA by captured graphs), and
+for comparison of `SceneModel.render`, frame by frame, where a GPU mostly waits for launches.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from many_cells import read_cell, run_cells, write_cell
 
 CLIPS = ("lift-and-swing", "carry", "throw-and-catch")
 KINDS = ("full", "auto")
-WITHIN_DB, PARAMETERS, RENDER = 0.15, 0.10, 0.50
+WITHIN_DB, PARAMETERS, RENDER = 0.20, 0.15, 0.50
 ROUNDS = 15  # short ones, both models in each: machines have slow minutes
 
 
@@ -69,8 +69,11 @@ def train(name: str, kind: str, options: argparse.Namespace) -> dict[str, Any]:
             continue
         loaded = LoadedRun.open(path, device=options.device)
         scores = score(loaded.model, loaded.clip, timing_frames=0, held_out=not label)
-        regions = ("human_object", "full", "background")
+        regions = ("human_object", "human", "object", "full", "background")
         found[f"{label}psnr"] = {region: scores.score(region, "psnr") for region in regions}
+        if not label:
+            cameras = "held-out cameras"
+            found["held out"] = {r: scores.score(r, "psnr", cameras) for r in regions}
     loaded = LoadedRun.open(run, device=options.device)
     found["parameters"] = sum(p.numel() for p in loaded.model.parameters() if p.requires_grad)
     found["counts"] = loaded.model.count()
@@ -144,9 +147,10 @@ def summary(options: argparse.Namespace) -> bool:
     from hoigs.studies.jobs.cost import Machine
 
     rows, good = [], True
-    print("| clip | people and objects, dB: full | auto | difference | parameters | render time | "
-          "frame by frame | after compressing, dB | cost in full trainings | |")  # fmt: skip
-    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---|")
+    print("| clip | people and objects, dB: full | auto | difference | held out | "
+          "parameters | render time | frame by frame | after compressing, dB | "
+          "cost in full trainings | |")  # fmt: skip
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|---|")
     for name in options.clips:
         cells = {kind: read_cell(options.out, f"{name}-{kind}", settings_of(options))
                  for kind in KINDS}  # fmt: skip
@@ -160,14 +164,16 @@ def summary(options: argparse.Namespace) -> bool:
         share = auto["parameters"] / full["parameters"]
         times = render_times(name, options)
         render, plain = (times["share"][way] for way in ("played", "plain"))
-        passed = difference >= -WITHIN_DB and share <= PARAMETERS and render <= RENDER
+        beside = auto["held out"]["human_object"] - full["held out"]["human_object"]
+        passed = min(difference, beside) >= -WITHIN_DB and share <= PARAMETERS and render <= RENDER
         good &= passed
         cost = auto["after"]["full_trainings"]
-        rows.append({"clip": name, "difference_db": difference, "parameters": share,
-                     "render": render, "render_ms": times, "passed": passed, **cells})  # fmt: skip
+        rows.append({"clip": name, "difference_db": difference, "held_out_db": beside,
+                     "parameters": share, "render": render, "render_ms": times,
+                     "passed": passed, **cells})  # fmt: skip
         print(
             f"| {name} | {full['psnr']['human_object']:.2f} | {auto['psnr']['human_object']:.2f} | "
-            f"{difference:+.2f} | {100 * share:.1f} % | {100 * render:.0f} % | "
+            f"{difference:+.2f} | {beside:+.2f} | {100 * share:.1f} % | {100 * render:.0f} % | "
             f"{100 * plain:.0f} % | "
             f"{auto['compact_psnr']['human_object']:.2f} | "
             f"{'–' if cost is None else f'{cost:.2f}'} | {'pass' if passed else 'FAIL'} |"

@@ -18,6 +18,7 @@ from hoigs.cli.common import (
     with_json,
 )
 from hoigs.cli.options import flags
+from hoigs.core.errors import HoigsError
 from hoigs.evaluation.options import EvaluateOptions
 from hoigs.studies.needs.options import NeedsOptions
 from hoigs.training.options import TrainOptions
@@ -83,10 +84,19 @@ def train(
             "training, prune and compress the model.",
         ),
     ] = False,
+    smallest: Annotated[
+        bool,
+        typer.Option(
+            "--smallest",
+            help="With --auto: search longer, for a model that is as small as can be, at a loss.",
+        ),
+    ] = False,
     *,
     options: TrainOptions,
 ) -> None:
     """Fit a model to a clip; then score it and write report.html."""
+    if smallest and not auto:
+        raise HoigsError("--smallest is a way of --auto: give both, or neither")
     with Display() as show:
         callbacks: dict[str, Any] = {
             "on_start": show.started, "on_step": show.step, "progress": show.fraction,
@@ -95,7 +105,9 @@ def train(
         if auto:
             from hoigs.studies.needs.auto import auto as train_auto
 
-            made = train_auto(clip, options=options, on_found=print_needs, **callbacks)
+            made = train_auto(
+                clip, options=options, smallest=smallest, on_found=print_needs, **callbacks
+            )
             run = made.run
         else:
             from hoigs.training.train import train as train_spec

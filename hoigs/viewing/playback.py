@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from typing import Literal
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -22,7 +23,27 @@ from hoigs.core.values.moment import Moment, MomentLayout
 
 Mode = Literal["auto", "graph", "cached", "plain"]
 
+AHEAD = 6  # frames of a film that are deformed at the same time
 TOLERANCE = 1e-4  # of each value of a Gaussian (metres, logits, …), relative to the largest
+
+
+@dataclass
+class _Lane:
+    """One frame on its way: its input, its Gaussians, and on CUDA the graphs that make them.
+
+    Attributes:
+        packed: time, poses and camera. joined: all Gaussians. graphs: of `_deform` and `_draw`.
+        output: of the second. stream: of the first; None in the lane of single frames.
+        deformed, drawn: when the graphs are done.
+    """
+
+    packed: Tensor
+    joined: Gaussians
+    graphs: tuple[Any, Any] | None = None
+    output: RenderOutput | None = None
+    stream: Any = None
+    deformed: Any = None
+    drawn: Any = None
 
 
 class Playback:
@@ -31,6 +52,9 @@ class Playback:
         play = Playback(model, views=[(clip.moments[p], clip.cameras[p]) for p in (0, 20, 40)])
         for moment, camera in film:
             image = play(moment, camera).color  # valid until the next call
+
+        for output in play.film(film):  # the same; on CUDA several frames are under way at once
+            image = output.color
 
     What depends on neither time nor pose is computed once (`DeformationModel.hold`), and Gaussians
     that never move are joined once. Time, poses and camera are copied into one buffer on the
@@ -99,11 +123,7 @@ class Playback:
         Raises:
             RenderError: a camera of another size, or a moment without a pose that is needed.
         """
-        if (camera.width, camera.height) != self._size:
-            raise RenderError(
-                f"Playback: made for {self._size[0]}x{self._size[1]}, but the camera is "
-                f"{camera.width}x{camera.height}; make another Playback for it"
-            )
+        self._require_size(camera)
         if self.mode == "plain":
             return self._plain(moment, camera)
         self.deform(moment, camera)
@@ -117,23 +137,99 @@ class Playback:
             RenderError: as a call, or the mode is "plain", which has no halves.
         """
         self._has_halves()
-        self._check_people(moment)
+        if not self._fits(moment):
+            self._set_up(moment)
+        lane = self._lane
         # not pinned: CUDA has copied it when this returns, so it may be freed
-        self._packed.copy_(self._pack(moment, camera), non_blocking=True)
-        if self.mode == "graph":
-            self._graphs[0].replay()
+        lane.packed.copy_(self._pack(moment, camera), non_blocking=True)
+        if lane.graphs is not None:
+            lane.graphs[0].replay()
         else:
-            self._deform()
-        return self._joined
+            self._deform(lane)
+        return lane.joined
 
     @torch.no_grad()
     def draw(self) -> RenderOutput:
         """The second half of a call: the image of the last `deform`."""
         self._has_halves()
-        if self.mode == "graph":
-            self._graphs[1].replay()
-            return self._output
-        return self._draw()
+        return self._drawn(self._lane)
+
+    @torch.no_grad()
+    def film(
+        self, views: Iterable[tuple[Moment, Camera]], ahead: int = AHEAD
+    ) -> Iterator[RenderOutput]:
+        """Draw views in their order, with more frames a second than by single calls.
+
+        A frame is many small kernels, each of which waits for the one before. So on CUDA the
+        Gaussians of so many frames are computed side by side, each in memory of its own, while
+        one is drawn; a frame comes as long after its view was taken. Elsewhere this calls for each
+        view.
+
+        Args:
+            ahead: frames that are under way at once.
+
+        Yields:
+            The output of each view, valid until the next one is asked for.
+
+        Raises:
+            RenderError: as a call.
+        """
+        under_way: deque[_Lane] = deque()
+        lanes: list[_Lane] = []
+        for place, (moment, camera) in enumerate(views):
+            if self.mode != "graph":
+                yield self(moment, camera)
+                continue
+            self._require_size(camera)
+            if not self._fits(moment):
+                while under_way:
+                    yield self._drawn(under_way.popleft())
+                self._set_up(moment)
+                lanes = []
+            lanes = lanes or self._lanes_ahead(ahead)
+            if len(under_way) == ahead:
+                yield self._drawn(under_way.popleft())
+            lane = lanes[place % ahead]
+            with torch.cuda.stream(lane.stream):
+                lane.stream.wait_event(lane.drawn)  # its last frame has been read
+                lane.packed.copy_(self._pack(moment, camera), non_blocking=True)
+                assert lane.graphs is not None
+                lane.graphs[0].replay()
+                lane.deformed.record()
+            under_way.append(lane)
+        while under_way:
+            yield self._drawn(under_way.popleft())
+
+    def _drawn(self, lane: _Lane) -> RenderOutput:
+        """The picture of a lane's Gaussians; all lanes are drawn on one stream, as renders share
+        memory there."""
+        if lane.graphs is None:
+            return self._draw(lane)
+        if lane.stream is not None:
+            torch.cuda.current_stream(self._device).wait_event(lane.deformed)
+        lane.graphs[1].replay()
+        if lane.stream is not None:
+            lane.drawn.record(torch.cuda.current_stream(self._device))
+        assert lane.output is not None
+        return lane.output
+
+    def _lanes_ahead(self, count: int) -> list[_Lane]:
+        """Lanes of a film, captured at its first frame."""
+        while len(self._ahead) < count:
+            lane = _Lane(self._lane.packed.clone(), self._lane.joined.clone())
+            lane.stream = torch.cuda.Stream(self._device)
+            lane.deformed, lane.drawn = torch.cuda.Event(), torch.cuda.Event()
+            self._capture(lane)
+            lane.drawn.record(torch.cuda.current_stream(self._device))
+            self._ahead.append(lane)
+        return self._ahead[:count]
+
+    def _require_size(self, camera: Camera) -> None:
+        if (camera.width, camera.height) != self._size:
+            raise RenderError(
+                f"Playback: made for {self._size[0]}x{self._size[1]}, but the camera is "
+                f"{camera.width}x{camera.height}; make another Playback for it"
+            )
 
     def _has_halves(self) -> None:
         if self.mode == "plain":
@@ -169,9 +265,7 @@ class Playback:
             self.mode = "cached"
         try:
             references = self._references()
-            self._hold(moment)
-            if self.mode == "graph":
-                self._capture()
+            self._set_up(moment)
             differs = self._difference(references)
         except (RuntimeError, TypeError, ValueError, NotImplementedError, PluginError) as error:
             # for example from a component that reads the time as a number
@@ -196,7 +290,7 @@ class Playback:
         for moment, camera, plain in references:
             self(moment, camera)
             for field, theirs in plain.tensors().items():
-                ours = self._joined.tensors()[field]
+                ours = self._lane.joined.tensors()[field]
                 worst = float((ours - theirs).abs().max()) if len(plain) else 0.0
                 if not worst <= TOLERANCE * max(1.0, float(theirs.abs().max())):
                     return f"{field} differ by {worst:.3g} from the plain path's"
@@ -212,67 +306,74 @@ class Playback:
         self._betas = {n: moment.poses[n].betas.detach().cpu().clone() for n in self._layout.people}
         self._given = {n: {"betas": on_device.poses[n].betas.clone()} for n in self._betas}
         state = self._model(on_device, self._names)
-        self._joined = state.joined(self._names).clone()
+        joined = state.joined(self._names).clone()
         self._rows = {
             name: rows
             for name, rows in state.slices(self._names).items()
             if self._model.entity(name).deformation.moves or self._moved_by_others(state, name)
         }
-        self._packed = self._pack(moment, self._views[0][1]).to(self._device)
+        packed = self._pack(moment, self._views[0][1]).to(self._device)
+        self._lane, self._ahead = _Lane(packed, joined), list[_Lane]()
 
     def _moved_by_others(self, state: SceneState, name: str) -> bool:
         residual = state.residuals.get(name)
         return residual is not None and residual.means is not None
 
-    def _check_people(self, moment: Moment) -> None:
-        """Check that all body poses are given; set up again if shapes or conventions changed."""
+    def _fits(self, moment: Moment) -> bool:
+        """Whether body shapes and conventions are those of the set-up.
+
+        Raises:
+            RenderError: a body pose is missing.
+        """
         for name in self._layout.people:
             if name not in moment.poses:
                 raise RenderError(
                     f'Playback: the moment has no body pose for "{name}"; it has '
                     f"{sorted(moment.poses) or 'none'}"
                 )
-        same = self._layout.fits(moment) and all(
+        return self._layout.fits(moment) and all(
             torch.equal(moment.poses[name].betas.cpu(), betas)
             for name, betas in self._betas.items()
         )
-        if not same:
-            self._model.eval()
-            self._hold(moment)
-            if self.mode == "graph":
-                self._capture()
+
+    def _set_up(self, moment: Moment) -> None:
+        """Compute what stays the same, and capture."""
+        self._model.eval()  # ends what was held
+        self._hold(moment)
+        if self.mode == "graph":
+            self._capture(self._lane)
 
     def _pack(self, moment: Moment, camera: Camera) -> Tensor:
         """View matrix [16], intrinsics [9], time and poses in one tensor, on the CPU."""
         return self._layout.pack(moment, camera.world_to_camera, camera.K)
 
-    def _moment(self) -> Moment:
+    def _moment(self, lane: _Lane) -> Moment:
         """The moment in the buffer."""
-        return self._layout.unpack(self._packed[25:], self._joined.means.dtype, self._given)
+        return self._layout.unpack(lane.packed[25:], lane.joined.means.dtype, self._given)
 
-    def _deform(self) -> None:
+    def _deform(self, lane: _Lane) -> None:
         """Compute the Gaussians that move, from the buffer."""
-        state = self._model(self._moment(), self._names)
+        state = self._model(self._moment(lane), self._names)
         for name, rows in self._rows.items():
             moved = state.gaussians[name]
             for field, value in moved.tensors().items():
-                into = self._joined.tensors()[field][rows]
+                into = lane.joined.tensors()[field][rows]
                 if field == "sh":  # higher bands, of other entities, are zero from the start
                     into = into[:, : value.shape[1]]
                 into.copy_(value)
 
-    def _draw(self) -> RenderOutput:
+    def _draw(self, lane: _Lane) -> RenderOutput:
         """Render the Gaussians with the camera in the buffer."""
-        kind = self._joined.means.dtype
+        kind = lane.joined.means.dtype
         camera = Camera(
-            self._packed[16:25].to(kind, copy=True).view(3, 3),
-            self._packed[:16].to(kind, copy=True).view(4, 4),
+            lane.packed[16:25].to(kind, copy=True).view(3, 3),
+            lane.packed[:16].to(kind, copy=True).view(4, 4),
             *self._size,
         )
-        moment = None if self._model.decoder is None else self._moment()
-        return self._model.draw(self._joined, camera, self._request, moment)
+        moment = None if self._model.decoder is None else self._moment(lane)
+        return self._model.draw(lane.joined, camera, self._request, moment)
 
-    def _capture(self) -> None:
+    def _capture(self, lane: _Lane) -> None:
         """Capture one graph of `_deform` and one of `_draw`."""
         device = self._device
         graphs = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
@@ -281,13 +382,13 @@ class Playback:
         # set the stream here too, as a failed capture does not restore the previous one
         with torch.no_grad(), torch.cuda.device(device), torch.cuda.stream(side), side_by_side({}):
             for moment, camera in self._views:  # compiles kernels, fills caches, sizes buffers
-                self._packed.copy_(self._pack(moment, camera))
-                self._deform()
-                self._draw()
+                lane.packed.copy_(self._pack(moment, camera))
+                self._deform(lane)
+                self._draw(lane)
             with capturing(graphs[0], side):
-                self._deform()
+                self._deform(lane)
             with capturing(graphs[1], side):
-                self._output = self._draw()
+                lane.output = self._draw(lane)
         torch.cuda.current_stream(device).wait_stream(side)
-        self._graphs = graphs
+        lane.graphs = graphs
         self.captures += 1

@@ -89,8 +89,8 @@ def test_gaussians_in_every_reading(fusion: str, field_at: str) -> None:
         moment, camera = view(time)
         wanted = model(moment).joined()
         play(moment, camera)
-        torch.testing.assert_close(play._joined.means, wanted.means, atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(play._joined.quats, wanted.quats, atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(play._lane.joined.means, wanted.means, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(play._lane.joined.quats, wanted.quats, atol=1e-5, rtol=1e-4)
 
 
 def test_scale_about_the_camera() -> None:
@@ -101,7 +101,7 @@ def test_scale_about_the_camera() -> None:
         moment, camera = view(time)
         play(moment, camera)
         torch.testing.assert_close(
-            play._joined.means, model(moment).joined().means, atol=1e-5, rtol=1e-5
+            play._lane.joined.means, model(moment).joined().means, atol=1e-5, rtol=1e-5
         )
 
 
@@ -194,6 +194,36 @@ def test_cuda_graph_equals_the_plain_path() -> None:
     assert play.captures == 2
     plain = model.render(taller.to("cuda"), camera.to("cuda")).color
     assert (drawn - plain).abs().mean() < 1e-5
+
+
+def test_a_film_is_its_frames_in_order() -> None:
+    model = scene(TorchRasterizer())
+    play = Playback(model, [view(0.4), view(0.9)])
+    with_others = [view(time) for time in (*TIMES, 0.6, *TIMES)]
+    frames = [output.color.clone() for output in play.film(with_others, ahead=3)]
+    assert len(frames) == len(with_others)
+    for (moment, camera), frame in zip(with_others, frames, strict=True):
+        assert torch.equal(frame, play(moment, camera).color)
+    assert list(play.film([])) == []
+    with pytest.raises(RenderError, match="made for 24x24, but the camera is 48x24"):
+        next(play.film([(with_others[0][0], with_others[0][1].resized(48, 24))]))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_cuda_film_is_its_frames_in_order() -> None:
+    from hoigs.rasterizers.warp import WarpRasterizer
+
+    model = scene(WarpRasterizer()).to("cuda")
+    play = Playback(model, [view(0.4), view(0.9)])
+    moment, camera = view(0.6)
+    other = moment.with_pose("human", moment.poses["human"].replace(betas=torch.tensor((2.0, 1.0))))
+    shots = [*map(view, TIMES), (other, camera), *map(view, TIMES[::-1])]
+    frames = [output.color.clone() for output in play.film(iter(shots), ahead=3)]
+    assert (len(frames), play.captures) == (len(shots), 3 * (1 + 3))
+    for (moment, camera), frame in zip(shots, frames, strict=True):
+        plain = model.render(moment.to("cuda"), camera.to("cuda")).color
+        assert (frame - plain).abs().mean() < 1e-5
 
 
 @pytest.mark.gpu

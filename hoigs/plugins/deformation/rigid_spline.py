@@ -26,6 +26,7 @@ from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual, displaced
 from hoigs.plugins.deformation.keyframes import Keyframed, KeyframedConfig
+from hoigs.plugins.deformation.rigid_track import RigidTrack
 
 # The distance of a rigid motion from the track that it started on.
 
@@ -78,6 +79,9 @@ class RigidSplineConfig(KeyframedConfig):
 
     rotation: Literal["cubic", "slerp"] = "cubic"
     """"cubic", smooth, or "slerp", at constant speed between knots."""
+    about_track: bool = False
+    """Move the object by all frames of its track, and let the spline correct them; else the spline
+    starts near the track, and moves the object alone."""
 
 
 class RigidSpline(Keyframed):
@@ -91,7 +95,8 @@ class RigidSpline(Keyframed):
     Parameters, for K knots: `keyframe_translations` and `translation_tangents` [K, 3], metres;
     `keyframe_quats` [K, 4]; `angular_tangents` [K, 3], radians, in the object's frame. Tangents
     and `velocity` are per keyframe interval of the K knots at the start. With a track they start
-    as the splines nearest to it.
+    as the splines nearest to it; with `about_track` they start at rest, x(t) is moved by the
+    track's pose besides, as in `TrackedHermite`, and their rates are those of corrections.
     """
 
     Config: ClassVar = RigidSplineConfig
@@ -121,6 +126,11 @@ class RigidSpline(Keyframed):
         names += ["angular_tangents"] if self.learned and self.smooth else []
         self.knot_axes = dict.fromkeys(names, 0)
         self.guide = TrackGuide(self._track) if self._track is not None else None
+        self.carrier: RigidTrack | None = None
+        if self._track is not None and self.config.about_track:
+            self.carrier, self._track, self.guide = RigidTrack(self._track), None, None
+            corrections = dict.fromkeys(RigidSpline.rates, "pose")
+            self.rates = {**type(self).rates, **corrections}  # type: ignore[misc]
 
     def bind(self, canonical: Gaussians) -> None:
         means = canonical.means.detach()
@@ -222,18 +232,25 @@ class RigidSpline(Keyframed):
         means, quats = move_rigidly(
             means - self.center, normalize_quats(quats), quat, self.center + place
         )
+        if self.carrier is not None:
+            means, quats = self.carrier.place(means, quats, moment.time)
         moved = canonical.replace(means=displaced(means, residual), quats=quats)
         return self.lit(moved, canonical)
 
     def velocity(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """Exact time derivative of the means, metres per keyframe interval."""
         means, _ = self.shape(canonical, moment.time)
-        quat, _, turning, speed = self.pose(moment.time)
+        quat, place, turning, speed = self.pose(moment.time)
         own = torch.linalg.cross(turning.expand_as(means), means - self.center)
         inner = self.shape_velocity(canonical, moment.time)
         if inner is not None:
             own = own + inner
-        return own @ quats_to_matrices(quat).mT + speed
+        rotation = quats_to_matrices(quat).mT
+        own = own @ rotation + speed
+        if self.carrier is None:
+            return own
+        means = (means - self.center) @ rotation + self.center + place
+        return self.carrier.velocity(means, moment.time, own, self.knots.reference)
 
     @torch.no_grad()
     def traced(self, canonical: Gaussians, times: Sequence[float]) -> Float[Tensor, "T P 3"]:
@@ -241,7 +258,11 @@ class RigidSpline(Keyframed):
         quats, places = self.placed(times)
         shapes = torch.stack([self.shape(canonical, time)[0][rows] for time in times])
         turned = (shapes - self.center) @ quats_to_matrices(quats).mT
-        return turned + (places + self.center)[:, None]
+        paths = turned + (places + self.center)[:, None]
+        if self.carrier is None:
+            return paths
+        carried = [self.carrier.carry(x, time) for x, time in zip(paths, times, strict=True)]
+        return torch.stack(carried)
 
     @torch.no_grad()
     def resampled(self, times: Sequence[float], fit: Sequence[float]) -> dict[str, Tensor]:

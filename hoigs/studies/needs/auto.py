@@ -51,6 +51,7 @@ def auto(
     clip: Path | str | None,
     *,
     options: TrainOptions,
+    smallest: bool = False,
     on_found: Callable[[Needs], None] | None = None,
     on_start: OnStart | None = None,
     on_step: OnStep | None = None,
@@ -66,6 +67,8 @@ def auto(
 
     Args:
         clip: a clip folder, or "builtin:NAME", of a layout that one reader alone recognises.
+        smallest: search longer, for a model that is as small as can be; else it stays close to the
+            whole spec's quality.
         on_found: called with the result of the search, before the training.
         on_start, on_step, progress, report: as for `train`.
 
@@ -98,8 +101,9 @@ def auto(
         for folder in (path, compact):  # before the search, which may take hours
             RunFolder(folder).refuse_existing(options.overwrite, [clip], resumable=True)
         search = options.part(NeedsOptions).changed(
-            spec=name, out=answer, device=device, overrides=options.spec_settings(), rasterizer=None
-        )
+            spec=name, out=answer, device=device, overrides=options.spec_settings(),
+            rasterizer=None, smallest=smallest,
+        )  # fmt: skip
         found = needs(clip, options=search, report=report)
         trained = trained.changed(overrides=(), rasterizer=None, chunk=None)  # the answer has them
         if on_found is not None:

@@ -21,6 +21,9 @@ class NeedsOptions(FitOptions):
     """Ignore gains below this, dB."""
     share: float = 0.05
     """Share of the training frames to hold back (at least 3 frames), below 0.5."""
+    smallest: bool = True
+    """Try also what is cheaper in ways that only a whole training shows the loss of; without, the
+    search is short and the answer close to the whole spec."""
     search_spaces: Path | str | None = None
     """A YAML file of search spaces in place of hoigs's own."""
     allow_faults: bool = False

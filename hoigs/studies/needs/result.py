@@ -38,8 +38,9 @@ def cheapest_refit(
     """Index of the cheapest candidate that can reproduce the motion of the chosen one.
 
     The chosen one itself unless its deformations are splines over knots (`HasKnots`). Compared with
-    it are candidates of the same class with fewer uniform knots, refitted to its motion, and those
-    that do not move, which take its Gaussians halfway through the clip.
+    it are candidates of the same settings with fewer uniform knots, refitted to its motion, those
+    that do not move, which take its Gaussians halfway through the clip, and others over knots, by
+    the motion that they learned.
 
     Args:
         candidates: that were tried, cheapest first. place: index of the chosen one. trials: by name
@@ -73,8 +74,12 @@ def _held(
         if not cheaper.moves:
             middle = curve.traced(canonical, [0.5] * len(before))
             return screen.deviation(before, screen.on_screen(middle)) <= UNSEEN
-        if type(cheaper) is not type(curve) or not has_knots(cheaper):
+        if not has_knots(cheaper):
             return False
+        if not _same_but_knots(curve, cheaper):
+            with on_host(cheaper):
+                learned = screen.paths(cheaper, canonical)
+            return screen.deviation(before, learned) <= UNSEEN
         count = len(cheaper.knots)
         if cheaper.knots.movable or count >= len(curve.knots):
             return False
@@ -83,7 +88,16 @@ def _held(
             return screen.deviation(before, screen.paths(curve, canonical)) <= UNSEEN
 
 
+def _same_but_knots(one: DeformationModel, other: DeformationModel) -> bool:
+    if type(one) is not type(other):
+        return False
+    configs = (getattr(model, "config", None) for model in (one, other))
+    kept = [x and x.model_dump(exclude={"keyframes", "keyframe_step", "adaptive"}) for x in configs]
+    return kept[0] == kept[1]
+
+
 TOTAL = 2.5  # full trainings that search, final training and pruning may cost together
+QUICK = 1.8  # where the smallest model is not asked for
 FINAL, AFTER = 1.0, 0.1  # of these, for the final training and for pruning
 SETTLES = "train.rates.settle"
 SETTLE = 0.1  # of trials, answer and tuning: with constant rates the end of a training is noisy
@@ -97,12 +111,14 @@ class Settings:
         least: dB of gain that are ignored (`search_space.near_best`).
         share, frames: share of the training frames that is held back, and the least number.
         budget: full trainings that everything may cost, including the final training.
+        smallest: whether spaces that are for the smallest model only are searched.
     """
 
     least: float = 0.1
     share: float = 0.05
     frames: int = 3
     budget: float = TOTAL
+    smallest: bool = True
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ from hoigs.studies.needs.search_space import (
 from hoigs.studies.needs.trial import SELECTION, Trial, isolated, selection_view
 
 Report = Callable[[str], None]
+UNTRIED = "short trials do not show what a cheaper one loses (--smallest tries them)"
 CALIBRATION = 0.5  # of the budget of a search space that is calibrated
 
 
@@ -96,7 +97,8 @@ class Search:
         answers: list[Answer] = []
         waiting = [(space, block) for space in self.search_spaces for block in self._places(space)]
         for i, (space, block) in enumerate(waiting):
-            shares = sum(other.share for other, _ in waiting[i:])
+            shares = sum(other.share for other, _ in waiting[i:] if self._searched(other))
+            shares = max(shares, space.share)
             answer = self._answer(space, block, self.budget.left * space.share / shares)
             self.found = merged(self.found, answer.overrides)
             if answer.chosen is not None:
@@ -119,6 +121,9 @@ class Search:
             seconds=time.perf_counter() - began,
             full_seconds=pace * steps,
         )
+
+    def _searched(self, space: SearchSpace) -> bool:
+        return self.settings.smallest or not space.smallest_only
 
     def _settled(self, full: Spec) -> bool:
         """Whether the base spec or the user sets how rates end."""
@@ -168,6 +173,11 @@ class Search:
             self._overrides(candidate, blocks) for candidate in space.candidates
         ):
             return Answer(space, block, None, skipped="no chosen component has this setting")
+        if not self._searched(space):
+            taken = [c for c in space.candidates if c.name == space.untried]
+            if not taken:
+                return Answer(space, block, None, skipped=UNTRIED)
+            return self._chosen(space, block, taken[0], blocks, skipped=UNTRIED)
         held, apart = len(self.held), CALIBRATION * budget if space.calibrated else 0.0
         budget -= apart
         try:

@@ -70,6 +70,12 @@ class SearchSpace(ComponentConfig):
     """Search space to candidates; this space is skipped where one of these was chosen."""
     else_cheapest: bool = False
     """A skipped space takes its first candidate; otherwise it changes nothing."""
+    smallest_only: bool = False
+    """Searched only for the smallest model: its trials are too short to show what a cheaper
+    candidate loses in a whole training."""
+    untried: str | None = None
+    """Candidate that is taken where `smallest_only` keeps the space from being searched; None
+    changes nothing."""
 
 
 class _File(ComponentConfig):
@@ -102,6 +108,11 @@ def _check(search_spaces: Sequence[SearchSpace], path: Path) -> None:
     before: dict[str, list[str]] = {}
     for space in search_spaces:
         names = [candidate.name for candidate in space.candidates]
+        if space.untried is not None and space.untried not in names:
+            near = did_you_mean(space.untried, names)
+            raise HoigsError(
+                f"{path} {space.name}.untried: it has no candidate {space.untried!r}{near}"
+            )
         if len(set(names)) < len(names) or space.name in before:
             raise HoigsError(
                 f"{path} {space.name}: search spaces and their candidates need unique names"

@@ -16,7 +16,7 @@ def test_auto_searches_trains_prunes_and_compresses(tmp_path, monkeypatch):
     monkeypatch.setenv("HOIGS_CACHE", str(tmp_path / "cache"))
     out, lines, order = tmp_path / "mine", [], []
     made = hoigs.auto(
-        NAME, out=out, overrides=(*GIVEN, "train.steps=11"), rasterizer="warp", device="cpu",
+        NAME, out=out, overrides=(*GIVEN, "train.steps=24"), rasterizer="warp", device="cpu",
         evaluate=False, on_found=order.append, on_start=order.append, report=lines.append,
     )  # fmt: skip
     assert order == [made.needs, made.run.session], "the search is known before the training"

@@ -292,6 +292,41 @@ def test_frames_that_nobody_saw_hold_the_splines_less(seen, penalty):
     assert model.regularizers()["track"].item() == pytest.approx(penalty, rel=1e-3)
 
 
+def jagged_track(frames: int = 9) -> ObjectTrack:
+    generator = torch.Generator().manual_seed(3)
+    turns = 0.4 * torch.randn(frames, 3, generator=generator)
+    return track_of(
+        axis_angle_to_matrices(turns), 0.3 * torch.randn(frames, 3, generator=generator)
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_about_its_track_it_follows_every_frame_and_corrects_them(kind):
+    track = jagged_track()
+    assert worst(on_track(track, keyframes=3, **kind), track) > 0.05  # three knots are too few
+    entity = on_track(track, keyframes=3, about_track=True, **kind)
+    assert worst(entity, track) < 1e-5
+    model = entity.deformation
+    assert "track" not in model.regularizers() and set(model.rates.values()) == {"pose"}
+    with torch.no_grad():
+        model.keyframe_translations += torch.tensor([0.0, 0.0, 0.1])  # in the object's frame
+    expected = (entity.means + torch.tensor([0.0, 0.0, 0.1])) @ track.rotations[4].mT
+    torch.testing.assert_close(entity(Moment(0.5)).means, expected + track.translations[4])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_about_its_track_its_velocity_and_its_paths_are_exact(kind):
+    entity = on_track(jagged_track(), keyframes=4, about_track=True, **kind).double()
+    model = perturbed(entity.deformation)
+    for time in (0.07, 0.45, 0.93):
+        h = 1e-6
+        numeric = (entity(Moment(time + h)).means - entity(Moment(time - h)).means) / (2 * h * 3)
+        exact = model.velocity(entity.canonical, Moment(time))
+        torch.testing.assert_close(exact, numeric, atol=1e-6, rtol=1e-5)
+    path = model.traced(entity.canonical, [0.3])[0]
+    torch.testing.assert_close(path, entity(Moment(0.3)).means)
+
+
 def test_refuses_what_it_cannot_derive():
     with pytest.raises(ValueError, match="RigidSpline needs `keyframes`"):
         RigidSpline()
