@@ -87,7 +87,7 @@ class _Still:
         part, row = self.footage, slice(self.row, self.row + 1)
         return replace(
             part, numbers=part.numbers[row], lab=part.lab[row], person=part.person[row],
-            blank=part.blank[row],
+            blank=part.blank[row], held=part.held[row],
         )  # fmt: skip
 
 
@@ -233,6 +233,7 @@ def _colors(done: Sequence[tuple[_Still, PromptedMask]]):
         lab=np.concatenate([p.lab for p in parts]),
         person=np.concatenate([p.person for p in parts]),
         blank=np.concatenate([p.blank for p in parts]),
+        held=np.concatenate([p.held for p in parts]),
     )  # fmt: skip
     return color_model(joined, {row: found.soft for row, (_, found) in enumerate(done)})
 
