@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import cg
 
@@ -60,6 +60,7 @@ def walked(
 RADII = (0.012, 0.022, 0.04, 0.065, 0.1, 0.16)  # of the object, in diagonals of the image
 ROUNDS = 4
 AGAIN, ROOM = 2, 1.7  # growths about the middle of the last, in an ellipse of its area times this
+GROWN = 0.97  # intersection over union with the growth before, from which it grows no more
 USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
 ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.8, 0.5  # share of the person's colours, and that no limb reaches: see below
@@ -107,7 +108,7 @@ def prompted_mask(
     fixed[seed] = 6
     if box is not None:
         barred = barred | ~shown
-    growth = _Growth(footage, i, fixed, center, inside, known, box)
+    growth = _Growth(footage, i, fixed, center, inside, known, box, footage.colors(i))
     tried = growth.masks()
     judge = _Judge(footage, i, away, on_person, box, Motion.of(footage, i))
     if box is None and not at_rest and not on_person:
@@ -180,7 +181,7 @@ class _Judge:
         it than what is around it, as shares and as differences; how far the other masks, which grew
         at other sizes, agree with it; how large it is."""
         masks = [t.soft > 0.5 for t in tried]
-        part = self._unexplained(masks)
+        part, bins = self._unexplained(masks), bins_of(self.footage.colors(self.i))
         taken = [0.0 if part is None else (m & part).sum() / part.sum() for m in masks]
         flat = np.stack([m.ravel() for m in masks]).astype(np.float32)
         area, both = flat.sum(1), flat @ flat.T
@@ -188,7 +189,7 @@ class _Judge:
         return np.stack((
             np.log(np.maximum(self.quality(tried), POOR)),
             np.zeros(len(masks)) if part is None else np.log(np.array(taken) + 1e-3),
-            [self._of_limbs(m) for m in masks],
+            [self._of_limbs(m, bins) for m in masks],
             *np.array([self.motion.sets_off(m) for m in masks]).T,
             (alike.sum(1) - 1) / max(len(masks) - 1, 1),
             np.log(area),
@@ -205,15 +206,15 @@ class _Judge:
         part = labels == 1 + own[1:].argmax()
         return part if own[1:].max() > 0 and part.sum() < 0.1 * part.size else None
 
-    def _of_limbs(self, mask: Bool[np.ndarray, "h w"]) -> float:
+    def _of_limbs(self, mask: Bool[np.ndarray, "h w"], bins: Int[np.ndarray, "h w"]) -> float:
         """How common the colours of a mask's pixels are along limbs; where these are unknown, on
         the rest of a person that it lies on."""
         if self.footage.limbs is None:
             on = float(self.footage.person[self.i][mask].mean())
             return 0.5 * on * of_person(self.footage, self.i, mask) if on else 0.0
-        bins = bins_of(self.footage.colors(self.i)[mask])
-        own = histogram(bins, np.ones(len(bins)))
-        return float(np.minimum(1, self.footage.limbs[bins] / (own[bins] + 1e-6)).mean())
+        found = bins[mask]
+        own = histogram(found, np.ones(len(found)))
+        return float(np.minimum(1, self.footage.limbs[found] / (own[found] + 1e-6)).mean())
 
 
 def looks_like_person(footage: Footage, found: PromptedMask) -> bool:
@@ -330,6 +331,7 @@ class _Growth:
     seeds: Float[np.ndarray, "N 2"]
     known: ColorModel | None
     box: np.ndarray | None
+    colors: Float[np.ndarray, "h w 3"]
 
     def masks(self) -> list[_Tried]:
         """Those that grow, at several sizes, or odds of a box. A click is seldom in the middle:
@@ -340,12 +342,15 @@ class _Growth:
         reach = float(np.hypot(*(self.seeds - self.center).T).max())
         families: list[list[_Tried]] = [[] for _ in range(1 + AGAIN)]
         for radius in RADII:
-            found = self._grown(reach + radius * self.footage.diagonal)
+            found, before = self._grown(reach + radius * self.footage.diagonal), None
             for family in families:
                 if found is None:
                     break
                 family.append(found)
-                found = self._grown(found.spread, about=_ellipse(found.soft > 0.5))
+                mask = found.soft > 0.5
+                if before is None or overlap(mask, before) < GROWN:
+                    found = self._grown(found.spread, about=_ellipse(mask))
+                before = mask
         return [t for family in families for t in _steadied(family)]
 
     def _grown(
@@ -357,7 +362,7 @@ class _Growth:
         if about is not None:
             spread = float(np.sqrt(np.linalg.eigvalsh(about[1])[-1]))
         window = Window.around(middle[0], middle[1], 1.6 * spread + 4)
-        colors = window.cut(self.footage.colors(self.i))
+        colors = window.cut(self.colors)
         valid = window.inside(self.footage.shape)
         bins = bins_of(colors)
         fixed = np.where(valid, window.cut(self.fixed), -9)
@@ -378,13 +383,13 @@ class _Growth:
         soft = 1 / (1 + np.exp(-(space + fixed)))
         if self.box is None:
             soft = soft * (space > 0.4)
-        whole = bins_of(self.footage.colors(self.i)[::3, ::3])
+        whole = bins_of(self.colors[::3, ::3])
         others = histogram(whole, np.ones(whole.shape))
         person = self.footage.person[self.i]
         if (window.cut(person) * valid).mean() > 0.05:  # hands have their colours
             theirs = person & (window.paste(np.ones((window.n, window.n)), person.shape) == 0)
             if theirs.any():
-                bins_all = bins_of(self.footage.colors(self.i))
+                bins_all = bins_of(self.colors)
                 others = 0.4 * others + 0.6 * histogram(bins_all, theirs * 1.0)
         for _ in range(ROUNDS):
             near = histogram(bins, (soft < 0.5) * valid * 1.0)
@@ -417,7 +422,7 @@ class _Growth:
             y, x = np.nonzero(mask)
             half = 0.5 * max(np.ptp(x), np.ptp(y)) + 8
             window = Window.around((x.min() + x.max()) / 2, (y.min() + y.max()) / 2, half)
-            colors = window.cut(self.footage.colors(self.i))
+            colors = window.cut(self.colors)
             valid = window.inside(self.footage.shape)
             score = set_off(window.cut(mask) > 0.5, colors, bins_of(colors), valid)
             found.append(_Tried(mask.astype(np.float32), score, half))
