@@ -2,6 +2,7 @@
 
     python benchmarks/clicks.py                        # all cases, about a minute each
     python benchmarks/clicks.py club board-cam03 --sheet build/sheets --jobs 8
+    python benchmarks/clicks.py --anywhere 6           # the first mask alone, of clicks anywhere
 
 Real frames with truth. Into recordings of shared/data an object is drawn whose mask is known: it
 follows landmarks of a hand or flies, is blurred by its motion, softened, given noise, and the whole
@@ -14,6 +15,9 @@ A frame is right from an intersection over union of 0.5, partial where half of t
 the object's, else wrong; a mask where the object is out of the picture is wrong, none there is
 right. Of a racket and a club both masks are grown by 2 pixels, and a racket's head may be filled.
 `said`: wrong frames of which the tracker says that they are doubtful.
+
+With --anywhere the clicks are at random pixels of the object, in random frames, the same at each
+call, and the mask of the clicked frame is judged.
 """
 
 from __future__ import annotations
@@ -40,11 +44,15 @@ from hoigs.core.interfaces.estimator import (
     EntityMasks,
     EntityRequest,
     Estimates,
+    FramePrompt,
     Landmarks,
     PromptPoint,
     VideoRequest,
 )
+from hoigs.plugins.estimators.object_tracker import footage as tracker_footage
+from hoigs.plugins.estimators.object_tracker import scene as tracker_scene
 from hoigs.plugins.estimators.object_tracker.estimator import WEAK, ObjectTrackerEstimator
+from hoigs.plugins.estimators.object_tracker.prompts import prompted_mask
 from hoigs.plugins.estimators.object_tracker.states import DOUBTFUL
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -302,6 +310,8 @@ CASES = {
     "ball-juggle": Case("juggle", 0, 60),
     "ball-juggle-2": Case("juggle", 150, 210, click=(40, 0, 0)),
 }  # fmt: skip
+SAME_VIDEO = ("shell-game-2", "board-cam02-late", "board-cam03-early", "board-cam04-rim")
+FEWEST = 40  # pixels of an object that is clicked anywhere
 
 
 def painted(drawings: list[Drawing]) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray]:
@@ -451,24 +461,50 @@ def verdict(mask: np.ndarray, true: np.ndarray, thin: bool) -> tuple[str, float]
     return "right" if iou >= 0.5 else "partial" if on >= 0.5 else "wrong", iou
 
 
+def request(film: Footage, work: Path, entities: tuple[EntityRequest, ...] = ()) -> VideoRequest:
+    landmarks = None if film.landmarks is None else {"human": Landmarks(film.landmarks)}
+    known = Estimates(EntityMasks({"human": film.person}), landmarks)
+    (height, width), frames = film.frames[0].shape[:2], film.frames
+    return VideoRequest(
+        len(frames), width, height, lambda i: frames[i], work, work, entities=entities, known=known
+    )
+
+
+def anywhere(name: str, cache: Path, count: int) -> dict:
+    """The masks of `count` clicks at random pixels of the object in random frames."""
+    case, rng = CASES[name], np.random.default_rng(7)
+    film = footage_of(case, cache)
+    video = request(film, cache)
+    footage = tracker_footage.read_footage(video, film.person)
+    still = tracker_scene.is_static(footage)
+    scene = (tracker_scene.static_scene if still else tracker_scene.moving_scene)(footage)
+    shown = [i for i, true in enumerate(film.truth) if true is not None and true.sum() > FEWEST]
+    counts, ious, start = Counter(), [], time.process_time()
+    for _ in range(count):
+        i = shown[rng.integers(len(shown))]
+        y, x = np.argwhere(film.truth[i])[rng.integers(film.truth[i].sum())] + 0.5
+        prompt = FramePrompt(i, (PromptPoint(float(x), float(y)),))
+        soft = Image.fromarray(np.uint8(255 * prompted_mask(footage, scene, i, prompt).soft))
+        mask = np.asarray(soft.resize((video.width, video.height), Image.Resampling.BILINEAR)) > 127
+        word, iou = verdict(mask, film.truth[i], case.thin)
+        counts[word] += 1
+        ious.append(iou)
+    row = {"case": name} | {k: counts[k] for k in ("right", "partial", "wrong", "empty")}
+    seconds = time.process_time() - start
+    return row | {"said": 0, "click": None, "iou": float(np.mean(ious)), "seconds": seconds}
+
+
 def run(name: str, cache: Path, sheet: Path | None) -> dict:
     case = CASES[name]
     film = footage_of(case, cache)
     at = case.click[0]
     x, y = film.places[at] if film.places else click_on(film.truth[at])[:2]
-    known = Estimates(
-        EntityMasks({"human": film.person}),
-        None if film.landmarks is None else {"human": Landmarks(film.landmarks)},
-    )
     with tempfile.TemporaryDirectory() as work:
         frames = film.frames
         entity = EntityRequest(
             "object", "object", points=(PromptPoint(float(x), float(y)),), frame=at
         )
-        video = VideoRequest(
-            len(frames), frames[0].shape[1], frames[0].shape[0], lambda i: frames[i], Path(work),
-            Path(work), entities=(entity,), known=known,
-        )  # fmt: skip
+        video = request(film, Path(work), (entity,))
         start = time.process_time()
         row: dict = {"case": name}
         try:
@@ -534,18 +570,22 @@ def main() -> None:
     parser.add_argument("--sheet", type=Path, help="folder for pictures of the masks")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--anywhere", type=int, help="random clicks in each video")
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
-    names, rows = args.cases or list(CASES), []
+    names, rows, task, last = args.cases or list(CASES), [], run, args.sheet
+    if args.anywhere:
+        task, last = anywhere, args.anywhere
+        names = args.cases or [n for n in CASES if n not in SAME_VIDEO]
     print("| case | right | partial | wrong | said | empty | click | IoU | s | states |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     with ProcessPoolExecutor(args.jobs) as pool:
-        for row in pool.map(run, names, [args.cache] * len(names), [args.sheet] * len(names)):
+        for row in pool.map(task, names, [args.cache] * len(names), [last] * len(names)):
             rows.append(row)
             if "error" in row:
                 print(f"| {row['case']} | {row['error']} |", flush=True)
                 continue
-            states = ", ".join(f"{k} {n}" for k, n in row["states"].items())
+            states = ", ".join(f"{k} {n}" for k, n in row.get("states", {}).items())
             click = "-" if row["click"] is None else f"{row['click']:.2f}"
             print(
                 f"| {row['case']} | {row['right']} | {row['partial']} | {row['wrong']} "

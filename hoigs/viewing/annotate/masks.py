@@ -22,6 +22,7 @@ from hoigs.core.interfaces.estimator import (
 )
 from hoigs.plugins.estimators.mediapipe.estimator import MediapipeEstimator
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
+from hoigs.plugins.estimators.object_tracker.motion import BESIDE
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
 from hoigs.plugins.estimators.object_tracker.scene import (
     NEIGHBOURS,
@@ -86,7 +87,7 @@ class _Still:
         part, row = self.footage, slice(self.row, self.row + 1)
         return replace(
             part, numbers=part.numbers[row], lab=part.lab[row], person=part.person[row],
-            blank=part.blank[row],
+            blank=part.blank[row], held=part.held[row],
         )  # fmt: skip
 
 
@@ -193,8 +194,10 @@ class ClickMasks:
 
     def _made(self, frame: int) -> _Still:
         if self._still_scene is not None:
-            footage = self._read([frame])
-            return _Still.of(footage, replace(self._still_scene, footage=footage), 0)
+            beside = (frame - BESIDE, frame, frame + BESIDE)
+            footage = self._read([n for n in beside if 0 <= n < self.video.count])
+            scene = replace(self._still_scene, footage=footage)
+            return _Still.of(footage, scene, footage.numbers.index(frame))
         first = max(0, frame + NEIGHBOURS[0])
         numbers = list(range(first, min(self.video.count, frame + NEIGHBOURS[-1] + 1)))
         footage = self._read(numbers)
@@ -230,6 +233,7 @@ def _colors(done: Sequence[tuple[_Still, PromptedMask]]):
         lab=np.concatenate([p.lab for p in parts]),
         person=np.concatenate([p.person for p in parts]),
         blank=np.concatenate([p.blank for p in parts]),
+        held=np.concatenate([p.held for p in parts]),
     )  # fmt: skip
     return color_model(joined, {row: found.soft for row, (_, found) in enumerate(done)})
 

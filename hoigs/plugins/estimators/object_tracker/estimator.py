@@ -38,7 +38,7 @@ from hoigs.plugins.estimators.object_tracker.scene import (
     moving_scene,
     static_scene,
 )
-from hoigs.plugins.estimators.object_tracker.states import states_of
+from hoigs.plugins.estimators.object_tracker.states import mostly_doubtful, states_of
 from hoigs.plugins.estimators.object_tracker.tracker import (
     Said,
     at_rest,
@@ -105,7 +105,11 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 15  # of what is kept in `work`; raised when masks change
+VERSION = 16  # of what is kept in `work`; raised when masks change
+VAGUE = (
+    "most of what was found lies on a person and has their colours, and is dropped: click on it "
+    "in a frame that shows it beside them, or give a box"
+)
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 
@@ -188,7 +192,9 @@ class ObjectTrackerEstimator(Estimator):
             part = _part(progress, start, share)
             tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
         tracks, alike = told_apart(footage, scene, prompts, tracks)
-        notes += [*alike, *doubts(tracks, footage)]
+        vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
+        tracks |= dict.fromkeys(vague)
+        notes += [*alike, *(f"{name}: {VAGUE}" for name in vague), *doubts(tracks, footage)]
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states_of(footage, tracks)))
 
     def _prompted(

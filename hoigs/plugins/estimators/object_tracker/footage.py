@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -24,6 +24,14 @@ LIMBS = (
     ((27, 31), 0.20), ((28, 32), 0.20), ((0, 7), 0.40), ((0, 8), 0.40),
 )  # fmt: skip
 SHOULDERS, HIPS = (11, 12), (23, 24)
+# Pairs of landmarks between which the body itself is seen, if anything of it is: what lies farther
+# in front of the body than its limbs hides the middle of the torso first.
+BARE = (
+    (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (15, 19), (16, 20), (23, 25), (25, 27),
+    (24, 26), (26, 28), (7, 8),
+)  # fmt: skip
+THIN = 0.07  # radius of these, in torsos
+SAMPLED = 12  # frames in which the body's colours are learnt
 
 
 def skeletons(
@@ -75,12 +83,32 @@ def limbs(
     found = _inside(x, y, landmarks[[11, 12, 24, 23], :2])
     for (a, b), radius in LIMBS:
         # an end that is not seen is still where the limb would be: it is rather body than thing
-        start, along = landmarks[a, :2], landmarks[b, :2] - landmarks[a, :2]
-        share = ((x - start[0]) * along[0] + (y - start[1]) * along[1]) / max(along @ along, 1e-9)
-        share = share.clip(0, 1)
-        gap = np.hypot(x - start[0] - share * along[0], y - start[1] - share * along[1])
-        found |= gap < radius * torso
+        found |= _from_line(x, y, landmarks[a, :2], landmarks[b, :2]) < radius * torso
     return found
+
+
+def bare_limbs(
+    shape: tuple[int, int], people: Sequence[Float[np.ndarray, "33 4"]], torso: float
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels on the thin middles of limbs that are seen."""
+    y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
+    found = np.zeros(shape, bool)
+    for points in people:
+        lines = [points[list(ends), :2] for ends in BARE if points[list(ends), 3].min() > SEEN]
+        if points[list(SHOULDERS), 3].min() > SEEN:  # and of the torso its upper third
+            top, bottom = (points[list(pair), :2].mean(0) for pair in (SHOULDERS, HIPS))
+            lines.append(np.stack((top, top + (bottom - top) / 3)))
+        for start, end in lines:
+            found |= _from_line(x, y, start, end) < THIN * torso
+    return found
+
+
+def _from_line(x: np.ndarray, y: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distance of pixels from a piece of a line."""
+    along = end - start
+    share = ((x - start[0]) * along[0] + (y - start[1]) * along[1]) / max(along @ along, 1e-9)
+    share = share.clip(0, 1)
+    return np.hypot(x - start[0] - share * along[0], y - start[1] - share * along[1])
 
 
 def _inside(x: np.ndarray, y: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -108,6 +136,7 @@ class Footage:
         blank: pixels that show nothing, such as the black corners of a stabilised video.
         held: pixels of the person's mask that no limb of theirs reaches: rather a thing they hold,
             or wide clothes. All False where landmarks are unknown.
+        limbs: colours along people's limbs over the video; None where these are unknown.
     """
 
     numbers: tuple[int, ...]
@@ -116,6 +145,7 @@ class Footage:
     person: Bool[np.ndarray, "F h w"]
     blank: Bool[np.ndarray, "F h w"]
     held: Bool[np.ndarray, "F h w"]
+    limbs: Float[np.ndarray, "B"] | None = None
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -141,6 +171,21 @@ class Footage:
     def colors(self, i: int) -> Float[np.ndarray, "h w 3"]:
         """L*a*b* of one frame as float32, with lightness at half weight, as shadows change it."""
         return to_features(self.lab[i])
+
+
+def body_colors(
+    footage: Footage, people: Sequence[Float[np.ndarray, "F 33 4"]]
+) -> Float[np.ndarray, "B"] | None:
+    """Colours along the limbs over the video, which a thing that is held covers now and then; None
+    where no torso is seen."""
+    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
+    if not np.isfinite(lengths).any():
+        return None
+    torso, found = float(np.nanmedian(lengths)), []
+    for i in np.unique(np.linspace(0, len(footage) - 1, SAMPLED).astype(int)).tolist():
+        bare = bare_limbs(footage.shape, [p[i] for p in people], torso) & footage.person[i]
+        found += [histogram(bins_of(footage.colors(i)), bare * 1.0)] if bare.any() else []
+    return np.mean(found, 0) if found else None
 
 
 def to_features(lab: np.ndarray) -> Float[np.ndarray, "... 3"]:
@@ -180,8 +225,9 @@ def read_footage(
         progress((i + 1) / len(numbers))
     blank &= _is_border(blank)
     scale = size[1] / video.width
-    held = held_pixels(covered, skeletons(video, numbers, scale))
-    return Footage(numbers, scale, lab, covered, blank, held)
+    people = skeletons(video, numbers, scale)
+    footage = Footage(numbers, scale, lab, covered, blank, held_pixels(covered, people))
+    return replace(footage, limbs=body_colors(footage, people))
 
 
 def lab_of(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import (
-    HIPS,
-    SEEN,
-    SHOULDERS,
     Footage,
+    bare_limbs,
     bins_of,
     histogram,
     odds_of,
@@ -22,13 +20,6 @@ from hoigs.plugins.estimators.object_tracker.footage import (
 from hoigs.plugins.estimators.object_tracker.scene import Scene
 
 WRISTS = (15, 16)  # among MediaPipe's landmarks
-# Pairs of landmarks between which the body itself is seen, if anything of it is: what lies farther
-# in front of the body than its limbs hides the middle of the torso first.
-BARE = (
-    (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (15, 19), (16, 20), (23, 25), (25, 27),
-    (24, 26), (26, 28), (7, 8),
-)  # fmt: skip
-THIN = 0.07  # radius of these, in torsos
 REACH = 0.8  # torsos around the hands in which colours of things are learnt
 CHANGED = 6.0  # units of noise by which a pixel differs from the scene
 
@@ -69,7 +60,7 @@ class Likeness:
             if not first._hands(i):
                 continue
             bins = bins_of(footage.colors(i))
-            bare = first._bare(i) & footage.person[i]
+            bare = bare_limbs(footage.shape, [p[i] for p in people], torso) & footage.person[i]
             shown = footage.person[i] | (first._standing_out(i) > 0)
             near = (first._gap(i) < REACH * torso) & shown
             far = (first._gap(i) > 2 * REACH * torso) & ~footage.person[i]
@@ -120,26 +111,3 @@ class Likeness:
         """From 1 at the hands, falling with distance: a half at the length of a torso."""
         near = self.torso if np.isfinite(self.torso) else 0.12 * self.footage.diagonal
         return 1 / (1 + (self._gap(i) / near) ** 4)
-
-    def _bare(self, i: int) -> Bool[np.ndarray, "h w"]:
-        """Pixels on the thin middles of limbs that are seen."""
-        height, width = self.footage.shape
-        y, x = np.mgrid[:height, :width] + 0.5
-        found = np.zeros((height, width), bool)
-        for a, b in self._lines(i):
-            along = b - a
-            share = ((x - a[0]) * along[0] + (y - a[1]) * along[1]) / max(along @ along, 1e-9)
-            share = share.clip(0, 1)
-            gap = np.hypot(x - a[0] - share * along[0], y - a[1] - share * along[1])
-            found |= gap < THIN * self.torso
-        return found
-
-    def _lines(self, i: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        for person in self.people:
-            points = person[i]
-            for a, b in BARE:
-                if min(points[a, 3], points[b, 3]) > SEEN:
-                    yield points[a, :2], points[b, :2]
-            if points[list(SHOULDERS), 3].min() > SEEN:  # and of the torso its upper third
-                top, bottom = (points[list(pair), :2].mean(0) for pair in (SHOULDERS, HIPS))
-                yield top, top + (bottom - top) / 3

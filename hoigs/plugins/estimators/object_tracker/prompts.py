@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import cg
 
@@ -18,10 +18,8 @@ from hoigs.plugins.estimators.object_tracker.footage import (
     histogram,
     odds_of,
 )
-from hoigs.plugins.estimators.object_tracker.scene import (
-    Scene,
-    median_of,
-)
+from hoigs.plugins.estimators.object_tracker.motion import Motion
+from hoigs.plugins.estimators.object_tracker.scene import Scene, median_of
 
 # A soft mask that follows edges: a random walker with priors.
 
@@ -59,13 +57,16 @@ def walked(
     return solved.reshape(n, m).clip(0, 1).astype(np.float32)
 
 
-RADII = (0.022, 0.04, 0.065, 0.1, 0.16)  # of the object, in diagonals of the image
+RADII = (0.012, 0.022, 0.04, 0.065, 0.1, 0.16)  # of the object, in diagonals of the image
 ROUNDS = 4
+AGAIN, ROOM = 2, 1.7  # growths about the middle of the last, in an ellipse of its area times this
+GROWN = 0.97  # intersection over union with the growth before, from which it grows no more
 USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
 ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.8, 0.5  # share of the person's colours, and that no limb reaches: see below
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
-WEIGHTS = (1.0, 0.8, -1.0, 0.7)  # of `_Judge.features`, by 74 clicks in benchmarks/clicks.py
+WEIGHTS = (0.55, 1.2, -3.0, 2.0, 0.7, 2.0, 0.2)  # of `_Judge.features`, by 83 clicks anywhere
+POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
 
@@ -107,9 +108,9 @@ def prompted_mask(
     fixed[seed] = 6
     if box is not None:
         barred = barred | ~shown
-    growth = _Growth(footage, i, fixed, center, inside, known, box)
+    growth = _Growth(footage, i, fixed, center, inside, known, box, footage.colors(i))
     tried = growth.masks()
-    judge = _Judge(footage, i, away, on_person, box, _disc(footage.shape, inside, 4.0))
+    judge = _Judge(footage, i, away, on_person, box, Motion.of(footage, i))
     if box is None and not at_rest and not on_person:
         tried += growth.unexplained(away)
     if not tried:
@@ -153,7 +154,7 @@ class _Judge:
     away: Float[np.ndarray, "h w"]
     on_person: bool
     box: np.ndarray | None
-    clicked: Bool[np.ndarray, "h w"]
+    motion: Motion
 
     def quality(self, tried: list[_Tried]) -> list[float]:
         """How well each is set off, 0 to about 1."""
@@ -174,17 +175,24 @@ class _Judge:
         """Logarithms by which the best is chosen."""
         return self.features(tried) @ np.array(WEIGHTS)
 
-    def features(self, tried: list[_Tried]) -> Float[np.ndarray, "N 4"]:
+    def features(self, tried: list[_Tried]) -> Float[np.ndarray, "N 7"]:
         """What speaks for each mask: how well it is set off; how much it takes in of what differs
-        from the scene; how like the person it is; how like what was clicked its colours are."""
+        from the scene; how common its colours are along limbs; how much better one motion explains
+        it than what is around it, as shares and as differences; how far the other masks, which grew
+        at other sizes, agree with it; how large it is."""
         masks = [t.soft > 0.5 for t in tried]
-        part = self._unexplained(masks)
+        part, bins = self._unexplained(masks), bins_of(self.footage.colors(self.i))
         taken = [0.0 if part is None else (m & part).sum() / part.sum() for m in masks]
+        flat = np.stack([m.ravel() for m in masks]).astype(np.float32)
+        area, both = flat.sum(1), flat @ flat.T
+        alike = both / (area[:, None] + area - both)
         return np.stack((
-            np.log(np.array(self.quality(tried)) + 1e-4),
+            np.log(np.maximum(self.quality(tried), POOR)),
             np.zeros(len(masks)) if part is None else np.log(np.array(taken) + 1e-3),
-            [self._of_person(m) for m in masks],
-            np.log([self._like(m, self.clicked) + 0.1 for m in masks]),
+            [self._of_limbs(m, bins) for m in masks],
+            *np.array([self.motion.sets_off(m) for m in masks]).T,
+            (alike.sum(1) - 1) / max(len(masks) - 1, 1),
+            np.log(area),
         ), -1)  # fmt: skip
 
     def _unexplained(self, masks: list[np.ndarray]) -> Bool[np.ndarray, "h w"] | None:
@@ -198,15 +206,15 @@ class _Judge:
         part = labels == 1 + own[1:].argmax()
         return part if own[1:].max() > 0 and part.sum() < 0.1 * part.size else None
 
-    def _of_person(self, mask: Bool[np.ndarray, "h w"]) -> float:
-        share = float((self.footage.person[self.i] & mask).sum() / max(mask.sum(), 1))
-        return share * of_person(self.footage, self.i, mask)
-
-    def _like(self, mask: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
-        """Bhattacharyya coefficient of the colours of two regions."""
-        bins = bins_of(self.footage.colors(self.i))
-        own, theirs = (histogram(bins, region * 1.0) for region in (mask, other))
-        return float(np.sqrt(own * theirs).sum())
+    def _of_limbs(self, mask: Bool[np.ndarray, "h w"], bins: Int[np.ndarray, "h w"]) -> float:
+        """How common the colours of a mask's pixels are along limbs; where these are unknown, on
+        the rest of a person that it lies on."""
+        if self.footage.limbs is None:
+            on = float(self.footage.person[self.i][mask].mean())
+            return 0.5 * on * of_person(self.footage, self.i, mask) if on else 0.0
+        found = bins[mask]
+        own = histogram(found, np.ones(len(found)))
+        return float(np.minimum(1, self.footage.limbs[found] / (own[found] + 1e-6)).mean())
 
 
 def looks_like_person(footage: Footage, found: PromptedMask) -> bool:
@@ -323,25 +331,47 @@ class _Growth:
     seeds: Float[np.ndarray, "N 2"]
     known: ColorModel | None
     box: np.ndarray | None
+    colors: Float[np.ndarray, "h w 3"]
 
     def masks(self) -> list[_Tried]:
-        """Those that grow, at several sizes, or odds of a box."""
-        if self.box is None:
-            reach = float(np.hypot(*(self.seeds - self.center).T).max())
-            sizes = [(reach + r * self.footage.diagonal, 0.0) for r in RADII]
-        else:
-            sizes = [(float(max(self.box[2:] - self.box[:2])) / 2, odds) for odds in INSIDE]
-        return _steadied([found for size in sizes if (found := self._grown(*size)) is not None])
+        """Those that grow, at several sizes, or odds of a box. A click is seldom in the middle:
+        each size grows once more about the middle and in the shape of what it grew to."""
+        if self.box is not None:
+            half = float(max(self.box[2:] - self.box[:2])) / 2
+            return _steadied([t for odds in INSIDE if (t := self._grown(half, odds)) is not None])
+        reach = float(np.hypot(*(self.seeds - self.center).T).max())
+        families: list[list[_Tried]] = [[] for _ in range(1 + AGAIN)]
+        for radius in RADII:
+            found, before = self._grown(reach + radius * self.footage.diagonal), None
+            for family in families:
+                if found is None:
+                    break
+                family.append(found)
+                mask = found.soft > 0.5
+                if before is None or overlap(mask, before) < GROWN:
+                    found = self._grown(found.spread, about=_ellipse(mask))
+                before = mask
+        return [t for family in families for t in _steadied(family)]
 
-    def _grown(self, spread: float, inside: float) -> _Tried | None:
-        """inside: log-odds of the pixels of `box`."""
-        window = Window.around(self.center[0], self.center[1], 1.6 * spread + 4)
-        colors = window.cut(self.footage.colors(self.i))
+    def _grown(
+        self, spread: float, inside: float = 0.0, about: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> _Tried | None:
+        """inside: log-odds of the pixels of `box`. about: middle and shape of where it is sought,
+        as a matrix whose square root an ellipse's axes are; None: around the seeds."""
+        middle = self.center if about is None else about[0]
+        if about is not None:
+            spread = float(np.sqrt(np.linalg.eigvalsh(about[1])[-1]))
+        window = Window.around(middle[0], middle[1], 1.6 * spread + 4)
+        colors = window.cut(self.colors)
         valid = window.inside(self.footage.shape)
         bins = bins_of(colors)
         fixed = np.where(valid, window.cut(self.fixed), -9)
         y, x = np.mgrid[: window.n, : window.n] + 0.5
-        if self.box is None:
+        if about is not None:
+            off = np.stack((x, y), -1) * window.step + (window.x, window.y) - middle
+            far = np.einsum("...a,ab,...b", off, np.linalg.inv(about[1]), off)
+            space = 1.5 * (1 - far).clip(-2.5, 1)
+        elif self.box is None:
             cx, cy = window.cells(*np.asarray(self.seeds, float).T)
             distance = np.min([np.hypot(x - a, y - b) for a, b in zip(cx, cy)], 0)
             # a seed's own surroundings count, so that a line of clicks marks a long thing
@@ -353,13 +383,13 @@ class _Growth:
         soft = 1 / (1 + np.exp(-(space + fixed)))
         if self.box is None:
             soft = soft * (space > 0.4)
-        whole = bins_of(self.footage.colors(self.i)[::3, ::3])
+        whole = bins_of(self.colors[::3, ::3])
         others = histogram(whole, np.ones(whole.shape))
         person = self.footage.person[self.i]
         if (window.cut(person) * valid).mean() > 0.05:  # hands have their colours
             theirs = person & (window.paste(np.ones((window.n, window.n)), person.shape) == 0)
             if theirs.any():
-                bins_all = bins_of(self.footage.colors(self.i))
+                bins_all = bins_of(self.colors)
                 others = 0.4 * others + 0.6 * histogram(bins_all, theirs * 1.0)
         for _ in range(ROUNDS):
             near = histogram(bins, (soft < 0.5) * valid * 1.0)
@@ -392,11 +422,17 @@ class _Growth:
             y, x = np.nonzero(mask)
             half = 0.5 * max(np.ptp(x), np.ptp(y)) + 8
             window = Window.around((x.min() + x.max()) / 2, (y.min() + y.max()) / 2, half)
-            colors = window.cut(self.footage.colors(self.i))
+            colors = window.cut(self.colors)
             valid = window.inside(self.footage.shape)
             score = set_off(window.cut(mask) > 0.5, colors, bins_of(colors), valid)
             found.append(_Tried(mask.astype(np.float32), score, half))
         return _steadied(found)
+
+
+def _ellipse(mask: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
+    """Middle x, y of a mask, and the matrix of an ellipse somewhat larger than its own."""
+    at = np.argwhere(mask)[:, ::-1] + 0.5
+    return at.mean(0), ROOM * 4 * np.cov(at.T) + np.eye(2)
 
 
 def _whole(image: np.ndarray) -> Window:

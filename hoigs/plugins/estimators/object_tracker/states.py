@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool
@@ -45,6 +45,13 @@ def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str,
                 states[i] = _hidden(footage, own[around[0]], own[around[1]], others, i)
         found[name] = states
     return found
+
+
+def mostly_doubtful(states: Sequence[str]) -> bool:
+    """Whether more than half of an object's masks are doubtful: they are rather of something else,
+    and a training with them would learn that."""
+    doubtful, seen = (states.count(state) for state in (DOUBTFUL, SEEN))
+    return doubtful > seen
 
 
 def _at_edge(mask: Bool[np.ndarray, "h w"]) -> bool:

@@ -267,9 +267,12 @@ def test_a_path_from_a_known_place_does_not_begin_with_an_absence() -> None:
     assert path.seen.all() and (path.centers[:, 0] < 40).all()
 
 
-def test_a_click_on_the_person_is_noted(tmp_path: Path) -> None:
+def test_what_a_click_on_the_person_gives_is_noted_and_not_kept(tmp_path: Path) -> None:
+    """It was kept, doubtful, and a training would have learnt a leg as the object."""
     found = masks_of(request(tmp_path, world(), (click(0, 50, 66),)))
     assert "lies on the person and has their colours" in found.notes[0]
+    assert set(found.states["object"]) == {"lost"}
+    assert not any(found.entities["object"][i].any() for i in range(COUNT))
 
 
 def test_a_click_on_a_thing_that_the_persons_mask_takes_in_is_not_doubted(tmp_path: Path) -> None:

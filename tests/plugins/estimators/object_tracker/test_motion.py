@@ -1,0 +1,66 @@
+"""What moves together, which tells a thing from what it is before where colours do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from disc_world import H, W, texture
+from scipy import ndimage
+from test_behind import footage_of
+
+from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
+from hoigs.plugins.estimators.object_tracker.motion import Motion
+from hoigs.plugins.estimators.object_tracker.prompts import overlap, prompted_mask
+from hoigs.plugins.estimators.object_tracker.scene import static_scene
+
+Y, X = np.mgrid[:H, :W] + 0.5
+
+
+def disc(x: float, radius: float = 14) -> np.ndarray:
+    return np.hypot(X - x, Y - 36) < radius
+
+
+def footage():
+    """A disc of the wall's colours that moves 3 pixels a frame."""
+    wall, ball = (texture(seed, (120, 130, 90))[:, :W] for seed in (0, 1))
+    frames = []
+    for i in range(5):
+        image = wall.copy()
+        image[disc(44 + 3 * i)] = np.roll(ball, 3 * i, 1)[disc(44 + 3 * i)]
+        frames.append(image.astype(np.uint8))
+    return footage_of(frames, [np.zeros((H, W), bool)] * 5)
+
+
+def test_one_motion_sets_a_disc_off_from_a_wall_of_its_colours() -> None:
+    motion = Motion.of(footage(), 2)
+    shares, differences = np.array(
+        [motion.sets_off(m) for m in (disc(50), disc(50, 8), disc(50, 28), disc(90, 10))]
+    ).T
+    assert shares[0] > 0.5 and shares[0] > shares[1:].max() + 0.2
+    assert differences[0] > differences[1:].max() + 0.3
+
+
+def test_a_frame_alone_says_nothing_of_motion() -> None:
+    one = footage()
+    assert (
+        not Motion.of(footage_of([np.zeros((H, W, 3), np.uint8)], [one.person[0]]), 0)
+        .sets_off(disc(50))
+        .any()
+    )
+
+
+@pytest.mark.parametrize("x, y", [(42, 28), (65, 42)])
+def test_a_click_anywhere_on_a_thing_of_two_colours(x: float, y: float) -> None:
+    """The middle of what is sought is the click at first, which is seldom the object's."""
+    wall, tan = texture(0, (90, 110, 120))[:, :W], texture(1, (200, 170, 120))[:, :W]
+    frames, things = [], []
+    for i in range(8):
+        middle = 12 + 14 * i
+        mask = (np.abs(X - middle) < 18) & (np.abs(Y - 36) < 13)
+        half = np.where((X - middle < 0)[..., None], tan - 60, tan)
+        image = np.where(mask[..., None], half, wall)
+        frames.append(ndimage.gaussian_filter(image, (0.5, 0.5, 0)).astype(np.uint8))
+        things.append(mask)
+    seen = footage_of(frames, [np.zeros((H, W), bool)] * 8)
+    found = prompted_mask(seen, static_scene(seen), 3, FramePrompt(3, (PromptPoint(x, y),)))
+    assert overlap(found.soft > 0.5, things[3]) > 0.8
