@@ -8,10 +8,12 @@ millimetres, sizes are the clip's in parts of the truth. `within` is the share o
 which the body is as near to the truth as the clip's report says.
 
 `up_off` and `up_said` are the degrees by which the clip's up is off, and those within which it says
-it is. `px_camNN` is the median distance of the body's joints from the true ones as camera NN sees
-them; `iou_camNN` how well the body's outline there agrees with the mask that the clip of that
-camera itself has of the man (looked at: right but for a fringe of hair and the gap below an arm),
-in frames without the board, mean. The row's own camera tells what a perfect pose could reach.
+it is. `guessed_of_far` counts the wrists more than 150 mm off about the shoulders of which the
+report says that their arm is a guess, of all such, and `guessed_of_near` the others. `px_camNN` is
+the median distance of the body's joints from the true ones as camera NN sees them; `iou_camNN` how
+well the body's outline there agrees with the mask that the clip of that camera itself has of the
+man (looked at: right but for a fringe of hair and the gap below an arm), in frames without the
+board, mean. The row's own camera tells what a perfect pose could reach.
 """
 
 from __future__ import annotations
@@ -110,7 +112,22 @@ def within(data: Path, camera: str, out: Path) -> dict[str, Any]:
     up = clip.cameras[0].world_to_camera[:3, :3].double().numpy() @ header["world"]["up"]
     off = np.degrees(np.arccos(np.clip(up @ view[:3, 2], -1, 1)))
     said = {"up_off": round(float(off), 1), "up_said": header["world"]["within"]}
-    return within_figures(joints, true, report["bodies_within"]["human"]) | said
+    human = report["bodies_within"]["human"]
+    return within_figures(joints, true, human) | said | guesses(joints, true, human["guessed"])
+
+
+FAR = 0.15  # metres that a wrist is off
+
+
+def guesses(joints: np.ndarray, true: np.ndarray, guessed: dict[str, list[int]]) -> dict[str, str]:
+    """How many of the wrists that are far off, and of the others, the report takes for guesses."""
+    about, true_about = (j - j[:, :2].mean(1, keepdims=True) for j in (joints, true))
+    off = np.linalg.norm(about - true_about, axis=-1)[:, -2:]
+    said = np.zeros(off.shape, bool)
+    for arm, name in enumerate(("left arm", "right arm")):
+        said[guessed[name], arm] = True
+    parts = {"guessed_of_far": off > FAR, "guessed_of_near": off <= FAR}
+    return {name: f"{(said & part).sum()}/{part.sum()}" for name, part in parts.items()}
 
 
 STEP, SHOWN = 4, 3  # frames from one that is compared to the next; how many become pictures
@@ -118,9 +135,9 @@ STEP, SHOWN = 4, 3  # frames from one that is compared to the next; how many bec
 
 def from_side(data: Path, folder: Path, camera: str, other: str, pictures: Path | None) -> float:
     """Mean IoU of one camera's body and another one's mask, as that one sees them."""
-    import hoigs
     from PIL import Image
 
+    import hoigs
     from hoigs.preparation.body.mask_fit import silhouette
 
     clip, seen, body = (
@@ -151,7 +168,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     """Markdown, one line a camera."""
     names = list(next(iter(rows.values())))
     lines = [["camera", *names], ["---"] * (len(names) + 1)]
-    lines += [[camera, *(f"{row[name]:g}" for name in names)] for camera, row in rows.items()]
+    lines += [[camera, *(f"{row[name]}" for name in names)] for camera, row in rows.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
