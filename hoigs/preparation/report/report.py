@@ -28,6 +28,8 @@ class BodyWithin:
             where it is not known.
         distance: of that middle from the camera. away: how far off the person is, median.
         size_from: how the body's size is known. unseen: parts that are hardly ever seen.
+        guessed: by limb, the frames in which the picture hides it or shows it elsewhere; `joints`
+            does not hold there.
     """
 
     joints: list[float | None]
@@ -35,6 +37,7 @@ class BodyWithin:
     away: float
     size_from: str
     unseen: list[str] = field(default_factory=list)
+    guessed: dict[str, list[int]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -299,6 +302,27 @@ def _bodies(report: Measures) -> Iterator[MeasureDiagnostic]:
         )
 
 
+def _guessed(name: str, within: BodyWithin, frames: int) -> Iterator[MeasureDiagnostic]:
+    """Limbs that are guesses in some frames; those that are hardly ever seen have a warning."""
+    found = {
+        limb: rows
+        for limb, rows in within.guessed.items()
+        if rows and f"{limb.split()[-1]}s" not in within.unseen
+    }
+    if found:
+        most = max(map(len, found.values()))
+        yield _judged(
+            f"limbs of {name}",
+            f"{most} of {frames} frames guessed",
+            "; ".join(f"{limb} in frames {ranges(rows)}" for limb, rows in found.items())
+            + ": its landmarks are hidden or out of the picture, or it is drawn where no mask is; "
+            "it may be off by a hand's length and more",
+            _judge(most / frames, 0.05, 0.5),
+            "look at these frames in overlay.mp4; leave them out if the limb matters (--start, "
+            "--end)",
+        )
+
+
 def _in_space(report: Measures) -> Iterator[MeasureDiagnostic]:
     """How far each body may be off, which its landmarks in the image do not show."""
     low, high = report.focal_range or (1.0, 1.0)
@@ -322,6 +346,7 @@ def _in_space(report: Measures) -> Iterator[MeasureDiagnostic]:
             "limbs that point to the camera or away from it are known least: judge the body from "
             "other sides than the camera's, and film with a camera that moves around the person",
         )
+        yield from _guessed(name, within, report.frames)
         share = math.hypot(_middle(within.distance, 0.5) / within.away, max(high - 1, 1 - low))
         legs = "; with the legs out of view nothing else shows it" * ("legs" in within.unseen)
         yield _judged(

@@ -58,6 +58,14 @@ def test_a_body_is_said_to_be_as_far_off_as_it_may_be() -> None:
     assert {d.kind: d.severity for d in diagnose(wide)}["distance of ann"] == "bad"
 
 
+def test_limbs_that_are_guesses_are_named_but_for_parts_that_are_never_seen() -> None:
+    guessed = {"left arm": [], "right arm": [1, 2], "left leg": [0, 1, 2, 3]}
+    within = BodyWithin([0.04] * 4, [0.1] * 4, 2.0, "", ["legs"], guessed)
+    judged = diagnose(dataclasses.replace(report(), bodies_within={"ann": within}))
+    [limbs] = [d for d in judged if d.kind == "limbs of ann"]
+    assert "right arm in frames 1-2" in limbs.what and "leg" not in limbs.what.split(":")[0]
+
+
 def test_a_body_of_unknown_error_is_said_to_be_one() -> None:
     within = BodyWithin([None] * 4, [None] * 4, 2.0, "taken for the mean")
     judged = diagnose(dataclasses.replace(report(), bodies_within={"ann": within}))
