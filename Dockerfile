@@ -7,7 +7,6 @@ ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 COPY pyproject.toml constraints.txt README.md LICENSE /hoigs/
 COPY hoigs /hoigs/hoigs
-RUN pip install -c /hoigs/constraints.txt torch --index-url "$TORCH_INDEX" \
-    && pip install -c /hoigs/constraints.txt '/hoigs[prepare,view]'
+RUN pip install -c /hoigs/constraints.txt '/hoigs[prepare,view]' --extra-index-url "$TORCH_INDEX"
 WORKDIR /work
 ENTRYPOINT ["hoigs"]

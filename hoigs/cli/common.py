@@ -21,6 +21,7 @@ from hoigs.core.system.files import printable
 if TYPE_CHECKING:
     from hoigs.evaluation.evaluate_run import EvaluatedRun
     from hoigs.training.session import Session
+    from hoigs.training.train import TrainedRun
     from hoigs.training.trainer import StepReport
 SetOption = Annotated[
     list[str] | None,
@@ -295,3 +296,18 @@ def print_scores(evaluated: EvaluatedRun) -> None:
         notes = [note for note in table.notes if note not in printed]
         print_table(table.title, table.columns, table.rows, notes)
         printed.update(notes)
+
+
+def print_summary(runs: dict[str, TrainedRun]) -> None:
+    """PSNR of the runs, region by region, on the same frames; the reports have all scores."""
+    regions = ("full", "human_object", "human", "object", "interaction", "background")
+    rows, given = [], ""
+    for name, run in runs.items():
+        assert run.evaluated is not None
+        for view in run.evaluated.evaluation.views:
+            found = [run.evaluated.evaluation.score(r, "psnr", view.name) for r in regions]
+            scores = (f"{s:.2f}" if isinstance(s, float) else str(s) for s in found)
+            rows.append((name, view.name, *scores))
+        given = given or run.evaluated.evaluation.views[0].protocol.given()
+    title = "; ".join(("PSNR, dB", *filter(None, [given])))
+    print_table(title, ("spec", "on", *regions), rows)

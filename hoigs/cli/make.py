@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hoigs.cli.common import Display, print_table, say, with_json
+from hoigs.cli.common import Display, print_summary, print_table, say, with_json
 from hoigs.cli.options import flags
 from hoigs.core.system.files import printable
 from hoigs.preparation.options import PrepareOptions
@@ -17,7 +18,6 @@ from hoigs.training.options import DemoOptions, RefineOptions
 
 if TYPE_CHECKING:
     from hoigs.preparation.estimates.plan import Consent, EstimatorPlan
-    from hoigs.training.train import TrainedRun
 
 
 @with_json
@@ -32,25 +32,10 @@ def demo(*, options: DemoOptions) -> None:
             options=options, on_start=show.started, on_step=show.step, progress=show.fraction,
             report=show.line,
         )  # fmt: skip
-    _compare(runs)
+    print_summary(runs)
     typer.echo(
         f"demo took {time.perf_counter() - began:.0f} s; open {Path(options.out) / 'report.html'}"
     )
-
-
-def _compare(runs: dict[str, TrainedRun]) -> None:
-    """PSNR of the runs, region by region, on the same frames; the reports have all scores."""
-    regions = ("full", "human_object", "human", "object", "interaction", "background")
-    rows, given = [], ""
-    for name, run in runs.items():
-        assert run.evaluated is not None
-        for view in run.evaluated.evaluation.views:
-            found = [run.evaluated.evaluation.score(r, "psnr", view.name) for r in regions]
-            scores = (f"{s:.2f}" if isinstance(s, float) else str(s) for s in found)
-            rows.append((name, view.name, *scores))
-        given = given or run.evaluated.evaluation.views[0].protocol.given()
-    title = "; ".join(("PSNR, dB", *filter(None, [given])))
-    print_table(title, ("spec", "on", *regions), rows)
 
 
 # `hoigs prepare`: make a clip folder from a video.
@@ -97,6 +82,7 @@ def prepare(
     typer.echo(f"report: {out / 'report.html'}")
     if (picture := out / "object.jpg").is_file():
         typer.echo(f"the object as it was found: {picture}")
+    say(f"train it: hoigs train {shlex.quote(str(out))}")
 
 
 def _announce(plan: EstimatorPlan) -> None:

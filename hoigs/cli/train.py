@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,8 +14,11 @@ from hoigs.cli.common import (
     Display,
     OverwriteOption,
     PluginOption,
+    Talk,
     print_scores,
+    print_summary,
     print_table,
+    say,
     with_json,
 )
 from hoigs.cli.options import flags
@@ -115,8 +119,14 @@ def train(
             run = train_spec(clip, options=options, **callbacks)
     if auto:
         _print_after(made.after)
-    if run.evaluated is not None:
+    if run.evaluated is None:
+        return
+    if Talk.verbose or Talk.tables is not None:
         print_scores(run.evaluated)
+    else:
+        print_summary({run.session.spec.name: run})
+        say("all scores, and how they were taken, are in the report")
+    say(f"look at it: hoigs view {shlex.quote(str(run.path))}")
 
 
 def _print_after(after: After) -> None:

@@ -28,6 +28,7 @@ def test_a_clip_without_test_frames(hoigs, tmp_path, frames):
                     "--device", "cpu", "--set", "train.steps=2")  # fmt: skip
     assert outcome.code == 0, outcome.err
     assert "not computed: the clip has no test frames" in outcome.out
+    assert outcome.out.count("┏") == 1  # one table; the report has all
     found = json.loads((run / "evaluation.json").read_text())
     reasons = {json.dumps(score["value"]) for score in found["scores"]}
     assert reasons == {'{"not_computed": "the clip has no test frames"}'}

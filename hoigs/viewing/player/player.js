@@ -184,12 +184,13 @@ function layout() {
 }
 
 // ---- drawing --------------------------------------------------------------------------------
-const VERTEX = `#version 300 es
+// once for every splat, in the order of drawing: where its ellipse is, how large, and of which colour
+const PLACED = `#version 300 es
 precision highp float; precision highp int;
 uniform highp sampler2D splats, bones, shares, changes, bands;
 uniform mat3 turn; uniform vec3 shift, eye; uniform vec2 focal, center, size; uniform float blur; uniform bool antialiased;
 in uint index;
-out vec4 color; out vec2 offset;
+out vec4 spot, tint; out vec2 shape; // middle and long axis, colour, half the short axis and how many sigmas
 vec4 get(sampler2D from, int i) { return texelFetch(from, ivec2(i % ${WIDTH}, i / ${WIDTH}), 0); }
 vec3 light(int first, int degree, float step, vec3 d) {
   float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
@@ -211,7 +212,7 @@ void main() {
   vec4 joint = get(splats, at + 4), weight = get(splats, at + 5);
   int row = int(wide.w);
   vec4 about = get(shares, row), more = get(shares, row + 1);
-  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  spot = tint = vec4(0.0); shape = vec2(0.0);
   int modes = int(about.y), count = int(more.y), mine = n - int(more.w), first = int(about.w) + ${CHANGE} * mine;
   float opacity = place.w;
   vec3 grown = vec3(0.0);
@@ -257,13 +258,24 @@ void main() {
   vec2 axis = abs(b) > 1e-6 ? normalize(vec2(b, big - a)) : (a >= c ? vec2(1, 0) : vec2(0, 1));
   float cut = sqrt(max(2.0 * log(255.0 * opacity), 0.0));
   if (cut <= 0.0) return;
-  vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
-  offset = corner * cut;
-  vec2 at2 = pixel + axis * offset.x * sqrt(big) + vec2(-axis.y, axis.x) * offset.y * sqrt(small);
   if (pixel.x + cut * sqrt(big) < 0.0 || pixel.x - cut * sqrt(big) > size.x ||
       pixel.y + cut * sqrt(big) < 0.0 || pixel.y - cut * sqrt(big) > size.y) return;
-  color = vec4(max(shade.rgb, 0.0), opacity);
-  gl_Position = vec4(2.0 * at2.x / size.x - 1.0, 1.0 - 2.0 * at2.y / size.y, 0.0, 1.0);
+  spot = vec4(pixel, axis * sqrt(big)); tint = vec4(max(shade.rgb, 0.0), opacity); shape = vec2(sqrt(small), cut);
+}`;
+const NOTHING = `#version 300 es
+precision highp float; void main() {}`;
+const VERTEX = `#version 300 es
+precision highp float;
+uniform vec2 size;
+in vec4 spot, tint; in vec2 shape;
+out vec4 color; out vec2 offset;
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  if (shape.y <= 0.0) return;
+  color = tint;
+  offset = shape.y * (vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0);
+  vec2 at = spot.xy + offset.x * spot.zw + offset.y * shape.x * normalize(vec2(-spot.w, spot.z));
+  gl_Position = vec4(2.0 * at.x / size.x - 1.0, 1.0 - 2.0 * at.y / size.y, 0.0, 1.0);
 }`;
 const FRAGMENT = `#version 300 es
 precision highp float;
@@ -275,25 +287,34 @@ void main() {
 }`;
 
 const canvas = $("canvas");
-let gl = null, program, uniforms = {}, textures = {}, order, orderBuffer;
-function prepare() {
-  if (gl) gl.deleteProgram(program);
-  else gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
-  if (!gl) throw new Error("this browser has no WebGL2");
-  program = gl.createProgram();
-  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
+let gl = null, placing, program, whole, uniforms = {}, textures = {}, order, orderBuffer, spots, sources, drawn;
+function built(vertex, fragment, captured) {
+  const made = gl.createProgram();
+  for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
     gl.shaderSource(shader, source); gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-    gl.attachShader(program, shader);
+    gl.attachShader(made, shader);
   }
-  gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
-  gl.useProgram(program);
-  for (const name of ["turn", "shift", "eye", "focal", "center", "size", "blur", "antialiased"]) uniforms[name] = gl.getUniformLocation(program, name);
+  if (captured) gl.transformFeedbackVaryings(made, captured, gl.INTERLEAVED_ATTRIBS);
+  gl.linkProgram(made);
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
+  return made;
+}
+
+function prepare() {
+  if (!gl) {
+    gl = canvas.getContext("webgl2", { antialias: false, alpha: false, preserveDrawingBuffer: true });
+    if (!gl) throw new Error("this browser has no WebGL2");
+    placing = built(PLACED, NOTHING, ["spot", "tint", "shape"]); program = built(VERTEX, FRAGMENT);
+    for (const name of ["turn", "shift", "eye", "focal", "center", "size", "blur", "antialiased"]) uniforms[name] = gl.getUniformLocation(placing, name);
+    whole = gl.getUniformLocation(program, "size");
+    orderBuffer = gl.createBuffer(); spots = gl.createBuffer(); sources = gl.createVertexArray(); drawn = gl.createVertexArray();
+  }
+  gl.useProgram(placing);
   const { splats, changes, bands } = layout();
   Object.entries({ splats, bones, shares, changes, bands }).forEach(([name, array], unit) => {
-    gl.uniform1i(gl.getUniformLocation(program, name), unit);
+    gl.uniform1i(gl.getUniformLocation(placing, name), unit);
     gl.activeTexture(gl.TEXTURE0 + unit);
     if (textures[name]) gl.deleteTexture(textures[name].texture);
     const texture = gl.createTexture(), rows = array.length / 4 / WIDTH;
@@ -305,13 +326,22 @@ function prepare() {
   });
   order = new Uint32Array(total);
   depths = new Float32Array(total); bins = new Uint16Array(total);
-  orderBuffer = orderBuffer || gl.createBuffer();
+  const width = 4 * 10; // bytes of a placed splat
+  gl.bindVertexArray(drawn);
+  gl.bindBuffer(gl.ARRAY_BUFFER, spots);
+  gl.bufferData(gl.ARRAY_BUFFER, width * total, gl.DYNAMIC_COPY);
+  for (const [name, count, start] of [["spot", 4, 0], ["tint", 4, 16], ["shape", 2, 32]]) {
+    const slot = gl.getAttribLocation(program, name);
+    gl.enableVertexAttribArray(slot);
+    gl.vertexAttribPointer(slot, count, gl.FLOAT, false, width, start);
+    gl.vertexAttribDivisor(slot, 1);
+  }
+  gl.bindVertexArray(sources);
   gl.bindBuffer(gl.ARRAY_BUFFER, orderBuffer);
   gl.bufferData(gl.ARRAY_BUFFER, order.byteLength, gl.DYNAMIC_DRAW);
-  const slot = gl.getAttribLocation(program, "index");
+  const slot = gl.getAttribLocation(placing, "index");
   gl.enableVertexAttribArray(slot);
   gl.vertexAttribIPointer(slot, 1, gl.UNSIGNED_INT, 0, 0);
-  gl.vertexAttribDivisor(slot, 1);
   gl.enable(gl.BLEND);
   gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
 }
@@ -362,7 +392,7 @@ function sort(camera) {
 }
 
 function draw() {
-  const ratio = Math.min(window.devicePixelRatio || 1, 2);
+  const ratio = Math.min(window.devicePixelRatio || 1, 2) * (moving() ? Math.ceil(8 * part) / 8 : 1);
   const width = Math.max(1, Math.round(canvas.clientWidth * ratio)), height = Math.max(1, Math.round(canvas.clientHeight * ratio));
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
   const camera = current(width, height);
@@ -370,6 +400,7 @@ function draw() {
   gl.viewport(0, 0, width, height);
   gl.clearColor(0, 0, 0, 1); gl.clear(gl.COLOR_BUFFER_BIT);
   const p = camera.pose;
+  gl.useProgram(placing); gl.bindVertexArray(sources);
   gl.uniformMatrix3fv(uniforms.turn, false, [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]]);
   gl.uniform3f(uniforms.shift, p[3], p[7], p[11]);
   gl.uniform3f(uniforms.eye, ...[0, 1, 2].map((j) => -(p[j] * p[3] + p[4 + j] * p[7] + p[8 + j] * p[11])));
@@ -378,6 +409,15 @@ function draw() {
   gl.uniform2f(uniforms.size, width, height);
   gl.uniform1f(uniforms.blur, motion.lowPass);
   gl.uniform1i(uniforms.antialiased, motion.antialiased ? 1 : 0);
+  gl.enable(gl.RASTERIZER_DISCARD);
+  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, spots);
+  gl.beginTransformFeedback(gl.POINTS);
+  gl.drawArrays(gl.POINTS, 0, count);
+  gl.endTransformFeedback();
+  gl.bindBufferBase(gl.TRANSFORM_FEEDBACK_BUFFER, 0, null);
+  gl.disable(gl.RASTERIZER_DISCARD);
+  gl.useProgram(program); gl.bindVertexArray(drawn);
+  gl.uniform2f(whole, width, height);
   gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
 }
 
@@ -451,6 +491,8 @@ function zoom(factor) {
 // ---- time and controls ----------------------------------------------------------------------
 let dirty = true, stale = true, before = 0;
 let LAST = 0, rate = 25;
+let part = 1, drew = false; // pixels a side, in parts of the screen's: fewer while what moves comes late
+const moving = () => playing || canvas.classList.contains("drag");
 
 function seek(value) { frame = Math.min(Math.max(value, 0), LAST); stale = dirty = true; controls(); }
 
@@ -469,7 +511,8 @@ function tick(now) {
     frame = Math.min(frame, LAST);
     stale = true; controls();
   }
-  before = now;
+  if (drew && moving()) part = Math.min(1, Math.max(0.25, part * (now - before > 40 ? 0.8 : now - before < 22 ? 1.02 : 1)));
+  before = now; drew = stale || dirty;
   const began = performance.now();
   if (stale) { place(); upload(); stale = false; dirty = true; }
   if (dirty) { dirty = false; draw(); window.drawn = (window.drawn || 0) + 1; window.spent = (window.spent || 0) + performance.now() - began; }
@@ -521,7 +564,7 @@ function wire() {
   let apart = 0;
   canvas.oncontextmenu = (e) => e.preventDefault();
   canvas.onpointerdown = (e) => { canvas.setPointerCapture(e.pointerId); fingers.set(e.pointerId, [e.clientX, e.clientY]); canvas.classList.add("drag"); apart = 0; };
-  canvas.onpointerup = canvas.onpointercancel = (e) => { fingers.delete(e.pointerId); canvas.classList.remove("drag"); apart = 0; };
+  canvas.onpointerup = canvas.onpointercancel = (e) => { fingers.delete(e.pointerId); canvas.classList.remove("drag"); apart = 0; dirty = true; };
   canvas.onpointermove = (e) => {
     const old = fingers.get(e.pointerId);
     if (!old) return;
