@@ -24,6 +24,9 @@ def test_auto_searches_trains_prunes_and_compresses(tmp_path, monkeypatch):
     assert made.needs is not None and made.run.session.spec.model_hash() == (
         made.needs.spec.model_hash()
     )
+    answers = {answer.space.name: answer for answer in made.needs.answers}
+    assert answers["human"].chosen.name == "planes" and not answers["human"].steps
+    assert answers["scene splats"].chosen is None, "fewer splats are for --smallest"
     data = json.loads((made.answer / "needs.json").read_text())
     assert data["after"]["bytes"][1] == made.after.compacted.bytes_after
     full, small = hoigs.open_run(out, device="cpu"), hoigs.open_run(made.compact, device="cpu")

@@ -227,6 +227,11 @@ def test_the_built_in_search_spaces_are_valid():
             " candidates: [{name: x, why: y}, {name: x, why: y}]}]",
             "name",
         ),
+        (
+            "search_spaces: [{name: a, kind: object, smallest_only: true, untried: plane,"
+            " candidates: [{name: planes, why: y}, {name: z, why: y}]}]",
+            "no candidate 'plane'; did you mean .planes",
+        ),
     ],
 )
 def test_search_spaces_of_a_file_are_checked(tmp_path, text, message):
