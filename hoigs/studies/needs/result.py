@@ -88,7 +88,7 @@ def _held(
             return screen.deviation(before, screen.paths(curve, canonical)) <= UNSEEN
 
 
-def _same_but_knots(one: DeformationModel, other: DeformationModel) -> bool:
+def _same_but_knots(one: object, other: object) -> bool:
     if type(one) is not type(other):
         return False
     configs = (getattr(model, "config", None) for model in (one, other))

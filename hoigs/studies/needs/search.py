@@ -174,10 +174,10 @@ class Search:
         ):
             return Answer(space, block, None, skipped="no chosen component has this setting")
         if not self._searched(space):
-            taken = [c for c in space.candidates if c.name == space.untried]
-            if not taken:
+            untried = [c for c in space.candidates if c.name == space.untried]
+            if not untried:
                 return Answer(space, block, None, skipped=UNTRIED)
-            return self._chosen(space, block, taken[0], blocks, skipped=UNTRIED)
+            return self._chosen(space, block, untried[0], blocks, skipped=UNTRIED)
         held, apart = len(self.held), CALIBRATION * budget if space.calibrated else 0.0
         budget -= apart
         try:
