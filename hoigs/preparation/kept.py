@@ -72,7 +72,7 @@ PLAN = {
         ("estimates", "cameras"),
         ("find_object", "body", "fit_steps", "person_height", "object_size", "chunk", "overlap"),
         slow=True,
-        version=5,
+        version=6,
     ),
     "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True),
     "objects": Stage(

@@ -31,7 +31,7 @@ from hoigs.preparation.body.start import first_guess
 # Gauss-Newton on the energy of the body fit.
 
 DAMPING, STUCK = 1e-3, 1e4
-ESTIMATED = (6, 9, 12)  # steps before which the landmarks' noise is estimated anew
+ESTIMATED = (6, 9, 12)  # steps before which ordinary motion is estimated anew
 RESCALED = (4, 8, 11)
 SETTLED = 14  # steps after which nothing but convergence is left to wait for
 ENOUGH_GAIN = 1e-3  # of the energy, below which a step is the last
@@ -47,7 +47,7 @@ def solve(problem: FitProblem, steps: int, progress: Callable[[float], None] | N
             unknowns = problem.rescale(unknowns)
             problem.measure(unknowns)
         if step in ESTIMATED:
-            problem.estimate_noise(unknowns)
+            problem.estimate_motion(unknowns)
         unknowns = problem.carry(unknowns, step / min(steps, SETTLED))
         better, damping, gain = _improved(problem, unknowns, widen, damping)
         unknowns = better
@@ -189,7 +189,7 @@ def fit_body(
 
     The most probable body, over all frames at once: robust reprojection of the landmarks, weighted
     by their visibility, and directions of bones against the 3D landmarks, where there are any,
-    each by its noise, which is estimated; joint limits and rest; accelerations in the world, in
+    each by how far such landmarks are off; joint limits and rest; accelerations in the world, in
     m/s^2, with the long tails that throws have; shape. Frames with fewer than `landmarks.ENOUGH`
     landmarks are carried by smoothness and, where there are any, masks.
 

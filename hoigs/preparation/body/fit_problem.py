@@ -26,19 +26,17 @@ from hoigs.preparation.body.kinematics import (
 from hoigs.preparation.body.landmarks import FEET, TORSO, LandmarkPoints, Landmarks, points_of
 from hoigs.preparation.body.mask_fit import MaskFit, Masks, Project
 from hoigs.preparation.body.priors import REST_LASTS as LASTS
-from hoigs.preparation.body.priors import MotionPrior, Noise, PosePrior, robust_weights
+from hoigs.preparation.body.priors import MotionPrior, PosePrior, robust_weights
 from hoigs.preparation.body.start import Start, first_guess
 from hoigs.preparation.options import FIT_STEPS
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Settings of the fit. Noise is estimated, so that few weights are left to choose.
+    """Settings of the fit.
 
     Attributes:
         steps: of Gauss and Newton, at most.
-        spread: how far a landmark may be off at first, in image widths; `Noise` replaces it.
-        space: the same of a 3D landmark, metres.
         unit: standard deviation of the 3D landmarks' unit of length, in parts of a metre.
         smooth: acceleration of points of the body in the world, m/s^2, that is ordinary; larger
             ones cost less than their square (a throw is no error).
@@ -58,8 +56,6 @@ class FitOptions:
     """
 
     steps: int = FIT_STEPS
-    spread: float = 0.006
-    space: float = 0.1
     unit: float = 0.1
     smooth: float = 6.0
     shape: float = 0.3
@@ -157,10 +153,11 @@ class Found:
     """What one fit has found and another keeps: all that frames share, and the first frames.
 
     Attributes:
-        ordinary: accelerations of `MotionPrior`. pose: of the first frames; None: of none.
+        noise: of landmarks, pixels. ordinary: accelerations of `MotionPrior`. pose: of the first
+            frames; None: of none.
     """
 
-    noise: Noise
+    noise: float
     ordinary: Float[Tensor, " K"]
     betas: Float[Tensor, " B"]
     offsets: Float[Tensor, "P 3"]
@@ -241,8 +238,10 @@ REWEIGHTINGS = 3  # for the 3D landmarks' origin
 AT_ONCE = 256  # frames whose derivatives are in memory
 ALL = slice(None)
 OF_FRAMES = ("visible", "pixels", "K", "viewmats", "in_space", "space")
-# metres on the person: no landmark is known better in the image (benchmarks/landmark_errors.py)
-LEAST_IMAGE = 0.015
+# standard deviations of landmarks, a component: in the image, metres on the person, and pixels at
+# least; in space, metres (benchmarks/landmark_errors.py). Estimates from the fit's own residuals
+# came out smaller on every recording: what is off alike in all frames does not show there.
+IN_IMAGE, LEAST_PIXELS, IN_SPACE = 0.015, 1.0, 0.1
 SPACE_LASTS = 0.5  # seconds in which the error of a 3D landmark stays what it is
 
 
@@ -300,11 +299,7 @@ class FitProblem:
         surface = (onto[len(self.points.joints) :].sum(0) > 0).double()
         self.offset_spread = options.offset * (1 + (SURFACE - 1) * surface)
         start = start or first_guess(body, landmarks, cameras, options.scale)
-        self.least_pixels = LEAST_IMAGE * self._pixels_a_metre(start)
-        self.noise = Noise(
-            torch.full((len(rows),), max(options.spread * self.width, self.least_pixels)).double(),
-            torch.full((len(rows), 3), options.space, dtype=torch.float64),
-        )
+        self.noise = max(IN_IMAGE * self._pixels_a_metre(start), LEAST_PIXELS)
         if turns is not None:
             start = replace(start, body=turns)
         self.begin = Unknowns.start(start, body.num_betas, pairs)
@@ -405,18 +400,12 @@ class FitProblem:
         size, _ = self.kinematics.size(unknowns.pose.betas)
         self.size = Size.by_face(size, cam[:, self.points.index(NOSE), 2], self.faces)
 
-    def estimate_noise(self, unknowns: Unknowns) -> None:
-        """Of the landmarks; and how strongly what they stand for accelerates."""
+    def estimate_motion(self, unknowns: Unknowns) -> None:
+        """How strongly what the landmarks stand for accelerates."""
         if self.found is not None:
             return
         points = self.posed(unknowns, derivatives=False).points
         pixels, cam = self.in_cameras(points, unknowns.scale)
-        residuals, _, _ = self._space_residuals(points, unknowns.unit, 1.0)
-        self.noise = self.noise.seen(
-            (pixels - self.pixels, self.visible),
-            (residuals, self.in_space),
-            self.least_pixels,
-        )
         # where the landmarks lie at the fit's depths, along the mean camera's two image axes
         metres = cam[..., 2:] / self.K[:, None, [0, 1], [0, 1]]
         axes = self.viewmats[:, :2, :3]
@@ -485,7 +474,7 @@ class FitProblem:
     ) -> float:  # fmt: skip
         pixels, cam = self.in_cameras(at.points, unknowns.scale)
         residuals = pixels - self.pixels
-        squares = residuals.square().sum(-1) / self.noise.pixels.square()
+        squares = residuals.square().sum(-1) / self.noise**2
         cost, weight = robust_weights(squares, widen)
         if equations is not None and shared is not None:
             by_point = _by_place(self.K, cam)
@@ -493,7 +482,7 @@ class FitProblem:
             by_shared = turned @ shared
             if self.find_scale:
                 by_shared[..., -1] = (by_point @ self.viewmats[:, None, :3, 3:])[..., 0]
-            weight = self.visible * weight / self.noise.pixels.square()
+            weight = self.visible * weight / self.noise**2
             equations.add(
                 residuals.flatten(1), weight[..., None].expand_as(residuals).flatten(1),
                 (turned @ at.by_frame).flatten(1, 2), by_shared.flatten(1, 2),
@@ -508,7 +497,7 @@ class FitProblem:
         residuals, weight, cost = self._space_residuals(at.points, unknowns.unit, widen)
         if equations is not None and shared is not None:
             turn = self.viewmats[:, None, :3, :3]
-            weight = weight[..., None] / self.noise.space.square()
+            weight = (weight / IN_SPACE**2)[..., None].expand_as(residuals)
             total = weight.sum(1, keepdim=True).clamp_min(1e-12)
             size = 1 + unknowns.unit
             shared = size * turn @ shared
@@ -532,12 +521,11 @@ class FitProblem:
         off = (1 + unit) * points @ self.viewmats[:, :3, :3].mT - self.space
         weight = self.in_space
         for _ in range(REWEIGHTINGS):
-            share = weight[..., None] / self.noise.space.square()
-            origin = (share * off).sum(1, keepdim=True) / share.sum(1, keepdim=True).clamp_min(
-                1e-12
-            )
+            share = weight[..., None]
+            total = share.sum(1, keepdim=True).clamp_min(1e-12)
+            origin = (share * off).sum(1, keepdim=True) / total
             residuals = off - origin
-            squares = (residuals / self.noise.space).square().sum(-1)
+            squares = residuals.square().sum(-1) / IN_SPACE**2
             cost, robust = robust_weights(squares, widen)
             weight = self.in_space * robust
         return residuals, weight, cost
@@ -589,8 +577,7 @@ class FitProblem:
             "landmark_error_px": round(mean, 2),
             "landmark_error_px_median": round(float(misses.nanmedian()), 2),
             "landmark_error_px_at_1280": round(mean * 1280 / self.width, 2),
-            "landmark_noise_px": round(float(self.noise.pixels.median()), 2),
-            "landmark_noise_m": round(float(self.noise.space.median()), 3),
+            "landmark_noise_px": round(self.noise, 2),
             "landmark_unit": round(1 + unknowns.unit, 3),
             "size": round(self.size.mean, 3),
             "size_spread": round(self.size.spread, 3),
