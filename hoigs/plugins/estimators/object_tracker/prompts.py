@@ -66,7 +66,7 @@ ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.8, 0.5  # share of the person's colours, and that no limb reaches: see below
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
 WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18)  # of `_Judge.features`, by 83 clicks anywhere
-MOVING = np.array((0.3, 0.4))  # most that motion says: a part of what turns is set off, too
+MOVING = np.array((0.3, 0.5))  # most that motion says: a part of what turns is set off, too
 POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
