@@ -65,7 +65,8 @@ USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and 
 ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.8, 0.5  # share of the person's colours, and that no limb reaches: see below
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
-WEIGHTS = (0.55, 1.2, -3.0, 2.0, 0.7, 2.0, 0.2)  # of `_Judge.features`, by 83 clicks anywhere
+WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18)  # of `_Judge.features`, by 83 clicks anywhere
+MOVING = np.array((0.3, 0.5))  # most that motion says: a part of what turns is set off, too
 POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
@@ -190,7 +191,7 @@ class _Judge:
             np.log(np.maximum(self.quality(tried), POOR)),
             np.zeros(len(masks)) if part is None else np.log(np.array(taken) + 1e-3),
             [self._of_limbs(m, bins) for m in masks],
-            *np.array([self.motion.sets_off(m) for m in masks]).T,
+            *np.clip([self.motion.sets_off(m) for m in masks], -MOVING, MOVING).T,
             (alike.sum(1) - 1) / max(len(masks) - 1, 1),
             np.log(area),
         ), -1)  # fmt: skip
