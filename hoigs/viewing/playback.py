@@ -172,8 +172,10 @@ class Playback:
             The output of each view, valid until the next one is asked for.
 
         Raises:
-            RenderError: as a call.
+            RenderError: as a call, or `ahead` is less than one.
         """
+        if ahead < 1:
+            raise RenderError(f"Playback.film: ahead is {ahead}, expected 1 frame or more")
         under_way: deque[_Lane] = deque()
         lanes: list[_Lane] = []
         for place, (moment, camera) in enumerate(views):

@@ -205,6 +205,8 @@ def test_a_film_is_its_frames_in_order() -> None:
     for (moment, camera), frame in zip(with_others, frames, strict=True):
         assert torch.equal(frame, play(moment, camera).color)
     assert list(play.film([])) == []
+    with pytest.raises(RenderError, match="ahead is 0, expected 1"):
+        next(play.film(with_others, ahead=0))
     with pytest.raises(RenderError, match="made for 24x24, but the camera is 48x24"):
         next(play.film([(with_others[0][0], with_others[0][1].resized(48, 24))]))
 

@@ -4,24 +4,35 @@ A richer model is ahead a little, or behind, on a scene that the simpler one des
 How much that is depends on the clip, its masks, the length of a trial and the renderer, so no
 number of dB can be right for long. Here it is measured: both are trained on what the trained
 simpler model draws, with that model's own errors under a random sign for every frame (the wild
-bootstrap, Wu 1986), and their gain there is subtracted from their gain on the clip (Efron and
-Tibshirani 1993, An Introduction to the Bootstrap, chapter 16).
+bootstrap, Wu 1986), and once more with the opposite signs, so that what the signs bring cancels
+(antithetic: Hammersley and Morton 1956). Frame by frame, the mean gain there is subtracted from the
+gain on the clip (Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 16): a frame
+in which one of them is always better, as its knots happen to lie, tells nothing.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import mean
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.values.clip import Clip, FrameStore
-from hoigs.studies.needs.search_space import SCORING, Gain, Halving, StepBudget, gain
+from hoigs.studies.needs.search_space import (
+    SCORING,
+    Gain,
+    Halving,
+    StepBudget,
+    differences,
+    gain,
+    mean_gain,
+)
 from hoigs.studies.needs.trial import Trial, region_of
 
+ERRORS = 2.0  # standard errors: with six frames, 5 % of what is useless is more (Student)
 OBVIOUS = 3.0  # dB, half of the squared error: where all of that is gained, nothing is measured
 
 
@@ -49,11 +60,11 @@ class DrawnStore(FrameStore):
 
 
 @torch.no_grad()
-def as_if_true(trial: Trial, seed: int = 0) -> Clip:
+def as_if_true(trial: Trial, flip: bool = False, seed: int = 0) -> Clip:
     """The view of a trial with images in which its model is the truth, where the trial is scored.
 
     Args:
-        trial: trained. seed: of the signs of its errors.
+        trial: trained. flip: turns all signs of its errors. seed: of these signs.
     """
     generator = torch.Generator().manual_seed(seed)
     model, view = trial.model, trial.view
@@ -66,7 +77,7 @@ def as_if_true(trial: Trial, seed: int = 0) -> Clip:
         output = model.render(frame.moment.to(model.device), frame.camera.to(model.device))
         behind = (1 - output.alpha.cpu())[..., None] * frame.rgb
         drawn = output.color.cpu() + behind
-        sign = 1.0 if torch.rand((), generator=generator) < 0.5 else -1.0
+        sign = 1.0 if (torch.rand((), generator=generator) < 0.5) != flip else -1.0
         found = (drawn + sign * (frame.rgb - drawn)).clamp(0, 1)
         image = torch.where(where[..., None], found, frame.rgb)
         images[position] = (255 * image).round().to(torch.uint8)
@@ -112,19 +123,30 @@ def calibrated(
     useless: dict[int, Gain] = {}
     for k in range(best):
         seen, own, top = halving.last_common(k, best)
-        found = gain(top, own)
+        found, errors = gain(top, own), 1.0
         if found.mean - found.error > OBVIOUS:
             continue
         scoring = SCORING * len(own.psnr)
-        price = costs[k] * (steps - seen + scoring) + (costs[k] + costs[best]) * (steps + scoring)
+        pair = (costs[k] + costs[best]) * (steps + scoring)
+        price = costs[k] * (steps - seen + scoring) + 2 * pair
         if price <= allowance.left:
             allowance.spend(f"{what}[{best}] where [{k}] is the truth", price)
             own = halving.scores[k][steps] = trials[k].advance(steps)
-            view = as_if_true(trials[k])
-            simple, rich = (trials[j].on(view).advance(steps) for j in (k, best))
-            useless[k] = gain(rich, simple)
-            found = gain(halving.scores[best][steps], own)
-            found = Gain(found.mean - useless[k].mean, math.hypot(found.error, useless[k].error))
-        if found.mean <= max(found.error, least):
+            null = _useless(trials[k], trials[best], steps)
+            useless[k] = mean_gain(null)
+            real = differences(halving.scores[best][steps], own)
+            found = mean_gain([gained - there for gained, there in zip(real, null, strict=True)])
+            errors = ERRORS
+        if found.mean <= max(errors * found.error, least):
             return Calibrated(k, useless)
     return Calibrated(best, useless)
+
+
+def _useless(simple: Trial, rich: Trial, steps: int) -> list[float]:
+    """What the rich one gains in each frame where the simple one is the truth, dB."""
+    gains = []
+    for flip in (False, True):
+        view = as_if_true(simple, flip)
+        cheap, dear = (trial.on(view).advance(steps) for trial in (simple, rich))
+        gains.append(differences(dear, cheap))
+    return [mean(both) for both in zip(*gains, strict=True)]

@@ -47,7 +47,7 @@ from hoigs.studies.needs.trial import SELECTION, Trial, isolated, selection_view
 
 Report = Callable[[str], None]
 UNTRIED = "short trials do not show what a cheaper one loses (--smallest tries them)"
-CALIBRATION = 0.5  # of the budget of a search space that is calibrated
+CALIBRATION = 0.6  # of the budget of a search space that is calibrated
 
 
 @dataclass

@@ -244,17 +244,30 @@ class Gain:
 
 
 def gain(of: Score, over: Score) -> Gain:
-    """How much better `of` is than `over`, frame by frame.
+    """How much better `of` is than `over`.
 
     Raises:
         ValueError: fewer than two frames, or not the same number.
+    """
+    return mean_gain(differences(of, over))
+
+
+def differences(of: Score, over: Score) -> list[float]:
+    """How much better `of` is than `over` in each frame, dB.
+
+    Raises:
+        ValueError: as `gain`.
     """
     if len(of.psnr) != len(over.psnr) or len(of.psnr) < 2:
         raise ValueError(
             f"a paired standard error needs the same two or more frames: {len(of.psnr)} and "
             f"{len(over.psnr)}"
         )
-    differences = [a - b for a, b in zip(of.psnr, over.psnr, strict=True)]
+    return [a - b for a, b in zip(of.psnr, over.psnr, strict=True)]
+
+
+def mean_gain(differences: Sequence[float]) -> Gain:
+    """Of differences in dB, one a frame."""
     return Gain(mean(differences), stdev(differences) / math.sqrt(len(differences)))
 
 

@@ -47,7 +47,7 @@ RICH = score(21.0, 22.1, 22.9)  # 1 dB ahead on the clip
 
 @pytest.fixture(autouse=True)
 def without_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(calibration, "as_if_true", lambda trial: trial)
+    monkeypatch.setattr(calibration, "as_if_true", lambda trial, flip: trial)
 
 
 def chosen(useless: Score, allowance: float = 1e3) -> tuple[calibration.Calibrated, StepBudget]:
@@ -60,8 +60,8 @@ def chosen(useless: Score, allowance: float = 1e3) -> tuple[calibration.Calibrat
 def test_what_gains_as_much_where_it_is_useless_is_not_needed() -> None:
     found, budget = chosen(useless=score(20.9, 22.0, 23.0))
     assert found.chosen == 0 and found.useless[0].mean == pytest.approx(0.97, abs=0.01)
-    # what is left of the simple one's trial, two trainings on its drawings, three scorings
-    assert budget.spent == pytest.approx(0.5 * 4 + 1.5 * 8 + (0.5 + 1.5) * 0.4 * 3)
+    # what is left of the simple one's trial, four trainings on its drawings, five scorings
+    assert budget.spent == pytest.approx(0.5 * 4 + 2 * 1.5 * 8 + (0.5 + 2 * 1.5) * 0.4 * 3)
 
 
 def test_what_gains_nothing_where_it_is_useless_is_needed() -> None:
@@ -92,12 +92,18 @@ def test_the_drawn_view_differs_where_the_trial_is_scored_alone(monkeypatch) -> 
     spec = Spec.load("hoigs", overrides=as_settings(overrides))
     trial = Trial(spec, view, "own", ["object"], default_registry())
     trial.advance(4)
-    drawn, again = as_if_true(trial), as_if_true(trial)
+    drawn, again, flipped = as_if_true(trial), as_if_true(trial), as_if_true(trial, flip=True)
     changed = 0
     for position in (*view.split["train"], *view.split[SELECTION]):
         before, after = view[position], drawn[position]
         where = region_of(before, view, "own", ["object"])
         assert torch.equal(before.rgb[~where], after.rgb[~where])
         assert torch.equal(after.rgb, again[position].rgb)
-        changed += bool((before.rgb[where] != after.rgb[where]).any())
+        kept, turned = (
+            (x.rgb[where] == before.rgb[where]).all() for x in (after, flipped[position])
+        )
+        assert not where.any() or kept != turned, (
+            "each frame has its own errors once, and once turned"
+        )
+        changed += not kept
     assert 0 < changed < len(view.split["train"]) + len(view.split[SELECTION])
