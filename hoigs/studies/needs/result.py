@@ -38,9 +38,9 @@ def cheapest_refit(
     """Index of the cheapest candidate that can reproduce the motion of the chosen one.
 
     The chosen one itself unless its deformations are splines over knots (`HasKnots`). Compared with
-    it are candidates of the same settings with fewer uniform knots, refitted to its motion, those
-    that do not move, which take its Gaussians halfway through the clip, and others over knots, by
-    the motion that they learned.
+    it are candidates of the same class: with fewer uniform knots, refitted to its motion, or with
+    other settings (a spline in place of a track), by the motion that they learned; and those that
+    do not move, which take its Gaussians halfway through the clip.
 
     Args:
         candidates: that were tried, cheapest first. place: index of the chosen one. trials: by name
@@ -74,7 +74,7 @@ def _held(
         if not cheaper.moves:
             middle = curve.traced(canonical, [0.5] * len(before))
             return screen.deviation(before, screen.on_screen(middle)) <= UNSEEN
-        if not has_knots(cheaper):
+        if type(cheaper) is not type(curve) or not has_knots(cheaper):
             return False
         if not _same_but_knots(curve, cheaper):
             with on_host(cheaper):
@@ -89,8 +89,7 @@ def _held(
 
 
 def _same_but_knots(one: object, other: object) -> bool:
-    if type(one) is not type(other):
-        return False
+    """Whether two models of a class have the same settings, knots apart."""
     configs = (getattr(model, "config", None) for model in (one, other))
     kept = [x and x.model_dump(exclude={"keyframes", "keyframe_step", "adaptive"}) for x in configs]
     return kept[0] == kept[1]
