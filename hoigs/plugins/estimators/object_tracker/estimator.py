@@ -105,7 +105,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 18  # of what is kept in `work`; raised when masks change
+VERSION = 19  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -208,11 +208,13 @@ class ObjectTrackerEstimator(Estimator):
             found = prompted_mask(footage, scene, i, prompt, known)
             if not (found.soft > 0.5).any():
                 raise HoigsError(nothing_there(entity, prompt, footage, i))
-            if looks_like_person(footage, found):
+            if prompt.box is None and looks_like_person(footage, found):
                 notes.append(
                     f"{entity.name}: what was clicked in frame {prompt.frame} lies on the person "
-                    "and has their colours: if it is a part of them, click on the object"
+                    "and has their colours, so it is not followed: click where it is before "
+                    "something else, or give a box"
                 )
+                continue
             if found.quality < SET_OFF and at_rest(scene, {i: found.soft > 0.5}):
                 notes.append(
                     f"{entity.name}: what was clicked in frame {prompt.frame} hardly differs from "
