@@ -40,7 +40,7 @@ RENAMED = {
     "to": "end",
 }
 # options that choose the function: --auto is hoigs.auto, --stage is hoigs.prepare_until(stage, ...)
-CHOOSING = {("train", "auto"), ("prepare", "stage")}
+CHOOSING = {("train", "auto"), ("train", "smallest"), ("prepare", "stage")}
 JSON = "json"  # --json is another way to print what a function returns
 # arguments that only a Python caller can give: objects and callbacks
 PYTHON = {"on_start", "on_step", "on_found", "progress", "report", "body", "estimators",
