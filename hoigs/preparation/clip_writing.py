@@ -27,9 +27,10 @@ from hoigs.preparation.draft import Draft
 from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.people import Body
+from hoigs.preparation.report.measures import BodyWithin
 from hoigs.preparation.report.object_seen import ObjectSeen, best_click, by_state
 from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
-from hoigs.preparation.report.report import BodyWithin, PrepareReport
+from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.upright import world_of
 from hoigs.preparation.video.source import SourceError
 

@@ -244,8 +244,9 @@ def _draw(
 
     def frames() -> Iterator[UInt8[np.ndarray, "H W C"]]:
         nonlocal drawn, draw_s
-        began, outputs = time.perf_counter(), play.film(film)
-        for (_, view), output in zip(film, outputs, strict=True):
+        for moment, view in film:
+            began = time.perf_counter()
+            output = play(moment, view)
             if output.color.is_cuda:
                 torch.cuda.synchronize(output.color.device)
             draw_s += time.perf_counter() - began
@@ -258,7 +259,6 @@ def _draw(
             if drawn % PIECE == 0:
                 release_time_rows(loaded.model)
             yield picture
-            began = time.perf_counter()
 
     began, replaced = time.perf_counter(), target.exists()
     try:

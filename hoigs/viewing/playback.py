@@ -163,7 +163,8 @@ class Playback:
         A frame is many small kernels, each of which waits for the one before. So on CUDA the
         Gaussians of so many frames are computed side by side, each in memory of its own, while
         one is drawn; a frame comes as long after its view was taken. Elsewhere this calls for each
-        view.
+        view. The first film captures graphs for each of them, which takes some seconds and as much
+        memory again. One film at a time, and no other call before it ends.
 
         Args:
             ahead: frames that are under way at once.

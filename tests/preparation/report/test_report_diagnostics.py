@@ -13,7 +13,9 @@ from test_prepare_report import report
 
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.cameras.camera_track import angular_factor, full_factor
-from hoigs.preparation.report.report import BodyWithin, diagnose, plot, report_page
+from hoigs.preparation.report.diagnosis import diagnose
+from hoigs.preparation.report.measures import BodyWithin
+from hoigs.preparation.report.page import plot, report_page
 
 
 def states(**changes: object) -> dict[str, tuple[str, str]]:

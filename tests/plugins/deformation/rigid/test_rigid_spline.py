@@ -147,15 +147,19 @@ def test_starts_at_rest_and_is_held_outside_the_clip(kind):
         torch.testing.assert_close(moved, last, atol=1e-6, rtol=1e-5)
 
 
+def require_derivative(entity: Entity, intervals: int) -> None:
+    """Its velocity, per one of so many intervals, is the numeric derivative of its means."""
+    model, h = perturbed(entity.deformation), 1e-6
+    for time in (0.07, 0.45, 0.99):
+        ahead, behind = (entity(Moment(time + step)).means for step in (h, -h))
+        exact = model.velocity(entity.canonical, Moment(time))
+        numeric = (ahead - behind) / (2 * h * intervals)
+        torch.testing.assert_close(exact, numeric, atol=1e-7, rtol=1e-6)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_velocity_is_the_derivative(kind):
-    entity = Entity(cloud(dtype=torch.float64), rigid(6, **kind))
-    model = perturbed(entity.deformation)
-    for time in (0.07, 0.45, 0.99):
-        h = 1e-6
-        numeric = (entity(Moment(time + h)).means - entity(Moment(time - h)).means) / (2 * h * 5)
-        exact = model.velocity(entity.canonical, Moment(time))
-        torch.testing.assert_close(exact, numeric, atol=1e-7, rtol=1e-6)
+    require_derivative(Entity(cloud(dtype=torch.float64), rigid(6, **kind)), intervals=5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -317,13 +321,8 @@ def test_about_its_track_it_follows_every_frame_and_corrects_them(kind):
 @pytest.mark.parametrize("kind", KINDS)
 def test_about_its_track_its_velocity_and_its_paths_are_exact(kind):
     entity = on_track(jagged_track(), keyframes=4, about_track=True, **kind).double()
-    model = perturbed(entity.deformation)
-    for time in (0.07, 0.45, 0.93):
-        h = 1e-6
-        numeric = (entity(Moment(time + h)).means - entity(Moment(time - h)).means) / (2 * h * 3)
-        exact = model.velocity(entity.canonical, Moment(time))
-        torch.testing.assert_close(exact, numeric, atol=1e-6, rtol=1e-5)
-    path = model.traced(entity.canonical, [0.3])[0]
+    require_derivative(entity, intervals=3)
+    path = entity.deformation.traced(entity.canonical, [0.3])[0]
     torch.testing.assert_close(path, entity(Moment(0.3)).means)
 
 
