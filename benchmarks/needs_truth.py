@@ -6,7 +6,8 @@
 A seed is used for the clip (textures, points, jolts) and for the training. Only the search spaces
 that a case names are searched, with the budget of a full search; --all searches all of them. A JSON
 is written for each case and seed as soon as it is done, and the same command continues after an
-interruption; --summary only reads the files.
+interruption; --summary only reads the files. --blur SIGMA makes the renderer worse, by a blur of so
+many pixels of what it draws (gradients pass through it): the answers should stay as they are.
 """
 
 from __future__ import annotations
@@ -48,6 +49,10 @@ CASES = {
     "eight": Case("figure-eight", {"object": RIGID_MANY}),
     "throw": Case("throw-and-catch", {"object": RIGID_MANY}),
     "bend": Case("bending-bar", {"object": BEYOND}),
+    "hinge": Case("hinged-bar", {"object": BEYOND}),
+    "soft": Case("soft-ball", {"object": BEYOND}),
+    "mirror": Case("mirror-box", {"object": RIGID_MANY}),
+    "alone": Case("moving-alone", {"object": RIGID_FEW, "interaction": ("off",)}),
     # Jolts of two pixels, over a sweep that leaves the arms room for them. A track that knows every
     # frame has them; one that knows every eighth does not, and they have to come from the hands.
     "push": Case(
@@ -100,6 +105,8 @@ def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     from hoigs.studies.needs.search import Search
 
     began = time.process_time()
+    if options.blur:
+        blur_renders(options.blur)
     needs = search_of(case, seed, options, Search).run()
     chosen = {a.space.name: a.chosen.name for a in needs.answers if a.chosen is not None}
     return {
@@ -114,9 +121,26 @@ def run(case: Case, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
+def blur_renders(sigma: float) -> None:
+    """From now on in this process, what the Warp rasterizer draws is blurred."""
+    from kornia.filters import gaussian_blur2d
+
+    from hoigs.rasterizers.warp.rasterizer import WarpRasterizer
+
+    sharp = WarpRasterizer.render
+
+    def render(self: Any, *given: Any, **named: Any) -> Any:
+        drawn = sharp(self, *given, **named)
+        color = drawn.color.permute(2, 0, 1)[None]
+        blurred = gaussian_blur2d(color, (7, 7), (sigma, sigma), border_type="replicate")
+        return replace(drawn, color=blurred[0].permute(1, 2, 0))
+
+    WarpRasterizer.render = render  # type: ignore[method-assign]
+
+
 def settings_of(options: argparse.Namespace) -> dict[str, Any]:
     """What a cell's result depends on."""
-    names = ("steps", "frames", "size", "share", "all")
+    names = ("steps", "frames", "size", "share", "blur", "all")
     return {name: getattr(options, name) for name in names}
 
 
@@ -143,6 +167,7 @@ def summary(options: argparse.Namespace) -> bool:
                 "of": len(done),
                 "seeds": options.seeds,
                 "chosen": [cell["chosen"] for cell in done],
+                "object_psnr": _median([_object_psnr(cell) for cell in done]),
                 "median_cpu_seconds": _median([cell["cpu_seconds"] for cell in done]),
                 "median_search_over_full": _median([cell["search_over_full"] for cell in done]),
             }
@@ -162,6 +187,12 @@ def summary(options: argparse.Namespace) -> bool:
     return good
 
 
+def _object_psnr(cell: dict[str, Any]) -> float:
+    """Of the best of the object's candidates, on the frames held back, dB."""
+    answer = next(a for a in cell["needs"]["answers"] if a["search_space"] == "object")
+    return max(statistics.mean(c["score"]["psnr"]) for c in answer["candidates"] if c["score"])
+
+
 def _median(values: list[float]) -> float | None:
     return round(statistics.median(values), 2) if values else None
 
@@ -174,6 +205,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=48)
     parser.add_argument("--size", type=int, default=96)
     parser.add_argument("--share", type=float, default=0.15, help="of training frames, held back")
+    parser.add_argument("--blur", type=float, default=0.0, help="sigma in pixels; 0: none")
     parser.add_argument("--all", action="store_true", help="search every search space")
     parser.add_argument("--jobs", type=int, default=1, help="searches at a time")
     parser.add_argument("--threads", type=int, default=1, help="of each")

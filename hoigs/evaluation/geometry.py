@@ -32,6 +32,8 @@ FIELDS = {
     "rotations": "object_rotations",
     "translations": "object_translations",
     "bend": "object_bend",
+    "bend_width": "object_bend_width",
+    "squeeze": "object_squeeze",
     "dressed": "dressed_vertices",
     "dressed_faces": "dressed_faces",
     "weights": "skinning_weights",
@@ -45,7 +47,8 @@ class Truth:
 
     Attributes:
         vertices, faces: of the object, about its centre. rotations, translations: object to world.
-        bend: its end-to-end angle, radians; 0 where it is rigid.
+        bend: its end-to-end angle, radians, over `bend_width` metres in its middle; squeeze: share
+            of its width; 0 and 1 where it is rigid.
         dressed, dressed_faces: the person in the zero pose. weights, transforms: its skinning.
     """
 
@@ -54,6 +57,8 @@ class Truth:
     rotations: Float[Array, "T 3 3"]
     translations: Float[Array, "T 3"]
     bend: Float[Array, " T"]
+    bend_width: Float[Array, ""]
+    squeeze: Float[Array, " T"]
     dressed: Float[Array, "W 3"]
     dressed_faces: Int[Array, "G 3"]
     weights: Float[Array, "W J"]
@@ -61,11 +66,11 @@ class Truth:
 
     def object_at(self, frame: int) -> tuple[Float[Array, "V 3"], Int[Array, "F 3"]]:
         """World vertices, metres, and faces."""
-        from hoigs.synthesis.object_motions import bend_points
+        from hoigs.synthesis.object_motions import bend_points, squeezed
 
-        vertices = self.vertices
+        vertices = squeezed(self.vertices, float(self.squeeze[frame]))
         if self.bend[frame] != 0:
-            vertices, _ = bend_points(vertices, float(self.bend[frame] / np.ptp(vertices[:, 0])))
+            vertices, _ = bend_points(vertices, float(self.bend[frame]), float(self.bend_width))
         return vertices @ self.rotations[frame].T + self.translations[frame], self.faces
 
     def human_at(self, frame: int) -> tuple[Float[Array, "W 3"], Int[Array, "G 3"]]:
@@ -78,6 +83,7 @@ class Truth:
 
 SHAPES = {
     "vertices": "V3", "faces": "F3", "rotations": "T33", "translations": "T3", "bend": "T",
+    "bend_width": "", "squeeze": "T",
     "dressed": "W3", "dressed_faces": "G3", "weights": "WJ", "transforms": "TJ44",
 }  # fmt: skip
 INDICES = {"faces": "vertices", "dressed_faces": "dressed"}

@@ -187,7 +187,8 @@ def save_truth(scene: SyntheticScene, path: Path) -> None:
 
     Arrays: cameras as in cameras.npz; poses as in bodies/human.npz; `object_vertices` and
     `object_faces` about the object's centre, `object_rotations`, `object_translations`,
-    `object_bend` (end-to-end angle, radians); `grip` (1 while the hands hold it);
+    `object_bend` (end-to-end angle, radians), `object_bend_width` (metres), `object_squeeze` (share
+    of the width); `grip` (1 while the hands hold it);
     `dressed_vertices` and `dressed_faces`: the clothed body in the zero pose, to be skinned with
     `skinning_weights` and, a frame, `skinning_transforms`.
     """
@@ -206,6 +207,8 @@ def save_truth(scene: SyntheticScene, path: Path) -> None:
         "object_rotations": track.rotations,
         "object_translations": track.translations,
         "object_bend": scene.script.bend,
+        "object_bend_width": np.float64(scene.script.bend_width),
+        "object_squeeze": scene.script.squeeze,
         "grip": scene.script.grip,
         "dressed_vertices": scene.dressed.vertices.astype(np.float32),
         "dressed_faces": scene.dressed.faces,

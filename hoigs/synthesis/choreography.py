@@ -23,7 +23,7 @@ from hoigs.synthesis.kinematics import (
     two_bone,
     unit,
 )
-from hoigs.synthesis.object_motions import ObjectScript, bend_points
+from hoigs.synthesis.object_motions import ObjectScript, bend_points, squeezed
 from hoigs.synthesis.walking import SIDES, Walk
 
 Array = np.ndarray
@@ -92,7 +92,10 @@ def hand_targets(script: ObjectScript, size: tuple[float, float, float]) -> Hand
     points, frames = [], []
     for side in SIDES:
         local = np.array([side * size[0] / 2, 0.0, -0.1 * size[2]])
-        pairs = [bend_points(local, bend / size[0]) for bend in script.bend]
+        pairs = [
+            bend_points(squeezed(local, squeeze), bend, script.bend_width)
+            for squeeze, bend in zip(script.squeeze, script.bend, strict=True)
+        ]
         contact = np.stack([p for p, _ in pairs])
         turn = hold.rotations @ np.stack([r for _, r in pairs])
         outward = turn @ (side * X)

@@ -12,7 +12,15 @@ from hoigs.core.config import ComponentConfig
 
 CameraPathName = Literal["orbit", "pan", "static"]
 ObjectMotionName = Literal[
-    "held", "thrown", "pushed", "bending", "static", "carried", "gliding", "figure-eight"
+    "held",
+    "thrown",
+    "pushed",
+    "bending",
+    "static",
+    "carried",
+    "gliding",
+    "figure-eight",
+    "squeezed",
 ]
 MOST_FRAMES = 100_000  # names of frames have five digits
 MOST_PIXELS = 8192  # a side
@@ -20,7 +28,8 @@ MOST_POINTS = 10_000_000
 OF_ONE_MOTION: dict[str, ObjectMotionName] = {
     "cycles": "figure-eight", "throw_turns": "thrown", "throw_height": "thrown",
     "hidden_share": "carried", "regrips": "pushed", "jolt_metres": "pushed",
-    "bend_degrees": "bending",
+    "bend_degrees": "bending", "bend_share": "bending", "squeeze_share": "squeezed",
+    "alone": "gliding",
 }  # fmt: skip
 
 
@@ -110,6 +119,19 @@ class ObjectConfig(ComponentConfig):
     )
     bend_degrees: float = Field(
         default=70.0, ge=0, le=150, description="of a bending bar, end to end"
+    )
+    bend_share: float = Field(
+        default=1.0, gt=0, le=1, description="of a bar's length that bends; 0.02 is a hinge"
+    )
+    squeeze_share: float = Field(
+        default=0.3, ge=0, lt=0.7, description="of the width that hands squeeze away"
+    )
+    alone: bool = Field(
+        default=False, description="a gliding object moves by itself, and the person stands still"
+    )
+    round: bool = Field(default=False, description="a ball as wide as `size` instead of a box")
+    mirror: float = Field(
+        default=0.0, ge=0, le=1, description="share of its light that it reflects as a mirror does"
     )
 
     @model_validator(mode="after")
@@ -276,6 +298,17 @@ CLIPS: Mapping[str, Mapping[str, Any]] = {
     "glide": {"object": {"motion": "gliding"}},
     "figure-eight": {"object": {"motion": "figure-eight"}},
     "bending-bar": {"object": {"motion": "bending", "size": (0.70, 0.12, 0.12)}},
+    "hinged-bar": {
+        "object": {
+            "motion": "bending",
+            "size": (0.60, 0.12, 0.12),
+            "bend_share": 0.02,
+            "bend_degrees": 60.0,
+        }
+    },
+    "soft-ball": {"object": {"motion": "squeezed", "size": (0.30, 0.30, 0.30), "round": True}},
+    "mirror-box": {"object": {"motion": "figure-eight", "mirror": 0.6}},
+    "moving-alone": {"object": {"motion": "gliding", "alone": True}},
     "jolted-push": {"object": {"motion": "pushed", "jolt_metres": 0.03}},
 }
 

@@ -144,6 +144,7 @@ def with_frames_dropped(scene: SyntheticScene) -> SyntheticScene:
             hold=Track(script.hold.rotations[kept], script.hold.translations[kept]),
             grip=script.grip[kept],
             bend=script.bend[kept],
+            squeeze=script.squeeze[kept],
         ),
         cameras=[scene.cameras[i] for i in kept],
         held_out=[(number[f], camera) for f, camera in scene.held_out if f in number],

@@ -20,13 +20,14 @@ from hoigs.core.values.moment import BodyPose
 from hoigs.synthesis.choreography import Choreographer
 from hoigs.synthesis.clothes import DressedBody, dress
 from hoigs.synthesis.config import SceneConfig
-from hoigs.synthesis.meshes import TexturedMesh, box, smooth_normals
-from hoigs.synthesis.object_motions import MOTIONS, ObjectScript, bent_mesh
+from hoigs.synthesis.meshes import TexturedMesh, ball, box, smooth_normals
+from hoigs.synthesis.object_motions import MOTIONS, ObjectScript, deformed_mesh
 from hoigs.synthesis.raycast import Layer, RayCaster, camera_path, fine_array, held_out_views
 from hoigs.synthesis.room import HIGH, LOW, Palette, Room, Stand, build_room
 from hoigs.synthesis.textures import TextureAtlas, crate_faces, faded, to_srgb
 
 Array = np.ndarray
+HINGE = 0.1  # share of a bar that bends; below it, strips would cross at the inner side
 ENTITIES = ("human", "object")  # numbers 1 and 2 in entity images; 0 is the scene
 
 
@@ -80,8 +81,9 @@ class SyntheticScene:
         config = self.config
         shell = Layer.build(self.shell, np.zeros(len(self.shell.faces), int))
         return RayCaster(
-            shell, self.atlas, config.light, (LOW, HIGH), config.samples, config.edge_samples
-        )
+            shell, self.atlas, config.light, (LOW, HIGH), config.samples, config.edge_samples,
+            mirror=config.object.mirror,
+        )  # fmt: skip
 
     @cached_property
     def _fine(self) -> wp.array:
@@ -89,11 +91,11 @@ class SyntheticScene:
 
     def object_at(self, frame: int) -> TexturedMesh:
         """The object's mesh in the world."""
-        angle = float(self.script.bend[frame]) / self.config.object.size[0]
-        track = self.script.track
-        return bent_mesh(self.object_mesh, angle).moved(
-            track.rotations[frame], track.translations[frame]
+        script = self.script
+        own = deformed_mesh(
+            self.object_mesh, script.bend[frame], script.bend_width, script.squeeze[frame]
         )
+        return own.moved(script.track.rotations[frame], script.track.translations[frame])
 
     def layer(self, frame: int) -> Layer:
         """Person, object and furniture of a frame, for ray casting."""
@@ -157,9 +159,12 @@ def generate(config: SceneConfig, body: BodyModel) -> SyntheticScene:
     room, atlas = _furnished(script.stands, config.seed)
     sides = crate_faces(np.random.default_rng(config.seed + 1), 256, config.object.textured)
     sides = [faded(side, config.object.contrast) for side in sides]
-    columns = 24 if config.object.motion == "bending" else 1
+    bar = config.object.motion == "bending"
+    columns = 1 if not bar else 24 if config.object.bend_share > HINGE else 2
     numbers = [len(atlas.levels) + i for i in range(6)]
     mesh = box(config.object.size, numbers, columns)
+    if config.object.round:
+        mesh = ball(config.object.size[0] / 2, numbers[0])
     return SyntheticScene(
         config=config,
         poses=poses,

@@ -37,7 +37,9 @@ class ObjectScript:
         track: of the object. hold: the path that the hands follow (where the object is, or would
             be, while they hold it).
         grip: 1 where the hands touch, 0 where they are away, smooth between.
-        bend: end-to-end angle, radians; 0 for a rigid object.
+        bend: end-to-end angle, radians; 0 for a rigid object. bend_width: length of the part in
+            the middle that bends, metres.
+        squeeze: width along x as a share of its own; 1 for a rigid object.
         stands: furniture that it stands on.
         walk: of the person. track and hold are in the person's frame until `in_world`.
     """
@@ -46,6 +48,8 @@ class ObjectScript:
     hold: Track
     grip: Float[Array, " F"]
     bend: Float[Array, " F"]
+    bend_width: float
+    squeeze: Float[Array, " F"]
     stands: tuple[Stand, ...]
     walk: Walk
 
@@ -60,30 +64,40 @@ class ObjectScript:
 
 
 def bend_points(
-    points: Float[Array, "*batch 3"], angle: float
+    points: Float[Array, "*batch 3"], bend: float, width: float
 ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 3 3"]]:
-    """Bends along x into an arc of unit stretch on the middle line.
+    """Bends the middle along x into an arc whose middle line keeps its length; ends stay straight.
 
     Args:
-        angle: radians a metre of x (end-to-end angle over length).
+        bend: angle between the ends, radians. width: length of the part that bends, metres.
 
     Returns:
         bent points, and the local rotation at each.
     """
-    phase = points[..., 0] * angle
+    within = np.clip(points[..., 0], -width / 2, width / 2)
+    phase = within * (bend / width)
     rotation = about(np.array([0, 1, 0]), phase.ravel()).reshape(*phase.shape, 3, 3)
-    x = points[..., 0] * np.sinc(phase / np.pi)
-    z = points[..., 0] * np.sinc(phase / (2 * np.pi)) * np.sin(phase / 2) * -1.0
+    x = within * np.sinc(phase / np.pi)
+    z = within * np.sinc(phase / (2 * np.pi)) * np.sin(phase / 2) * -1.0
     middle = np.stack((x, np.zeros_like(x), z), -1)
-    offset = points * np.array([0, 1.0, 1.0])
+    offset = np.concatenate(((points[..., 0] - within)[..., None], points[..., 1:]), -1)
     return middle + np.einsum("...ij,...j->...i", rotation, offset), rotation
 
 
-def bent_mesh(mesh: TexturedMesh, angle: float) -> TexturedMesh:
-    """`mesh` after `bend_points`."""
-    if angle == 0:
+def squeezed(points: Float[Array, "*batch 3"], squeeze: float) -> Float[Array, "*batch 3"]:
+    """A share of the width along x, at the same volume."""
+    return points * np.array([squeeze, squeeze**-0.5, squeeze**-0.5])
+
+
+def deformed_mesh(mesh: TexturedMesh, bend: float, width: float, squeeze: float) -> TexturedMesh:
+    """`mesh` after `bend_points` and `squeezed`."""
+    if squeeze != 1:
+        normals = squeezed(mesh.normals, 1 / squeeze)  # inverse transpose, of the same volume
+        normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+        mesh = replace(mesh, vertices=squeezed(mesh.vertices, squeeze), normals=normals)
+    if bend == 0:
         return mesh
-    vertices, rotations = bend_points(mesh.vertices, angle)
+    vertices, rotations = bend_points(mesh.vertices, bend, width)
     turned = np.einsum("fcij,fcj->fci", rotations[mesh.faces], mesh.normals)
     return replace(mesh, vertices=vertices, normals=turned)
 
@@ -175,7 +189,11 @@ class ObjectMotion(ABC):
     ) -> ObjectScript:
         """The script of a rigid object and a person who stands."""
         frames = len(self.u)
-        return ObjectScript(track, hold, grip, np.zeros(frames), stands, standing(frames))
+        return ObjectScript(
+            track, hold, grip,
+            bend=np.zeros(frames), bend_width=self.object.bend_share * self.object.size[0],
+            squeeze=np.ones(frames), stands=stands, walk=standing(frames),
+        )  # fmt: skip
 
 
 class Held(ObjectMotion):
@@ -277,7 +295,25 @@ class Gliding(ObjectMotion):
         height = np.full_like(sweep, 0.86 * self.object.lift_height)
         place = np.stack((0.22 * sweep, height + 0.08 * sweep, np.full_like(sweep, 0.5)), -1)
         track = Track(about(np.array([0, 1, 0]), yaw), place)
-        return self.scripted(track, track, np.ones(len(self.u)))
+        if not self.object.alone:
+            return self.scripted(track, track, np.ones(len(self.u)))
+        middle = len(self.u) // 2
+        hold = Track(*(x[middle : middle + 1].repeat(len(x), 0) for x in (
+            track.rotations, track.translations)))  # fmt: skip
+        return self.scripted(track, hold, np.zeros(len(self.u)))
+
+
+class Squeezed(ObjectMotion):
+    """Soft, held before the chest, squeezed between both hands three times (not rigid)."""
+
+    def script(self) -> ObjectScript:
+        height, t = 0.86 * self.object.lift_height, self.object.tilt_degrees
+        keys = [[u, 6 * k, 0.48, height + 0.05 * k, 0.2 * t * k, 0] for u, k in
+                ((0.0, -1), (0.3, 1), (0.65, -0.5), (1.0, 1))]  # fmt: skip
+        held = self.path(np.array(keys))
+        squeeze = 1 - self.object.squeeze_share * np.sin(3 * np.pi * self.u) ** 2
+        script = self.scripted(held, held, np.ones(len(self.u)))
+        return replace(script, squeeze=squeeze)
 
 
 class FigureEight(ObjectMotion):
@@ -346,5 +382,5 @@ class Static(ObjectMotion):
 
 MOTIONS: dict[str, type[ObjectMotion]] = {
     "held": Held, "thrown": Thrown, "pushed": Pushed, "bending": Bending, "static": Static,
-    "carried": Carried, "gliding": Gliding, "figure-eight": FigureEight,
+    "carried": Carried, "gliding": Gliding, "figure-eight": FigureEight, "squeezed": Squeezed,
 }  # fmt: skip

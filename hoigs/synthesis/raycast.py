@@ -1,7 +1,7 @@
 """Colour, depth and entities of a view by casting rays at triangle meshes (Warp mesh queries).
 
 Shading is Lambert with a fixed sun (a small disc, so shadows are soft) and a sky, neither of which
-depends on the view: two cameras that see one point see one colour.
+depends on the view: two cameras that see one point see one colour, unless it is a mirror's.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ class RayCaster:
     Args:
         shell: floor, walls and ceiling, which cast no shadow: the sun shines through them.
         room: corners of the room, low and high; its edges are dimmed.
+        mirror: share of its light that entity 2 reflects as a mirror does.
     """
 
     def __init__(
@@ -89,12 +90,14 @@ class RayCaster:
         room: tuple[Sequence[float], Sequence[float]],
         samples: int = 4,
         edge_samples: int = 16,
+        mirror: float = 0.0,
     ):
         wp.load_module(kernels, device="cpu", block_dim=1)  # as launched, before threads use it
         self.shell = shell
         self.texels: wp.array = wp.array(atlas.texels, dtype=wp.vec3, device="cpu")
         self.levels: wp.array = wp.array(atlas.levels, dtype=wp.vec3i, device="cpu")
         self.lights = _lights(light, room)
+        self.lights.mirror = mirror
         self.samples, self.edge_samples = samples, max(samples, edge_samples)
         offsets = pixel_samples(samples, self.edge_samples)
         self.offsets: wp.array = wp.array(offsets, dtype=wp.vec2, device="cpu")

@@ -19,6 +19,7 @@ FINE = 4  # micro-triangles along an edge of a face with mesh colours
 FINE_COUNT = (FINE + 1) * (FINE + 2) // 2
 DIRECTIONS = 8  # over the sun's disc and over the sky
 FAR = 100.0
+MIRROR = 2  # entity that may be a mirror
 REACH = 0.55  # of ambient occlusion, metres
 
 
@@ -39,6 +40,7 @@ class Lights:
     ground: wp.vec3
     shadows: wp.float32
     occlusion: wp.float32
+    mirror: wp.float32
     room_low: wp.vec3
     room_high: wp.vec3
     suns: wp.array(dtype=wp.vec3)
@@ -249,8 +251,36 @@ def radiance(
     if hit.layer == 0:
         return shade(shell, things.mesh, texels, levels, lights, view, ray, hit, sample)
     if hit.layer == 1:
-        return shade(things, things.mesh, texels, levels, lights, view, ray, hit, sample)
+        own = shade(things, things.mesh, texels, levels, lights, view, ray, hit, sample)
+        if lights.mirror > 0.0 and things.entity[hit.face] == MIRROR:
+            own.value *= 1.0 - lights.mirror
+            own.value += lights.mirror * reflected(
+                shell, things, texels, levels, lights, view, ray, hit, sample
+            )
+        return own
     return Shade()
+
+
+@wp.func
+def reflected(
+    shell: Surface, things: Surface, texels: wp.array(dtype=wp.vec3),
+    levels: wp.array(dtype=wp.vec3i, ndim=2), lights: Lights, view: View, ray: wp.vec3, hit: Hit,
+    sample: int,
+):  # fmt: skip
+    """What a flat mirror at the hit shows: one more ray, whose own mirrors are dull."""
+    flat = wp.mesh_eval_face_normal(things.mesh, hit.face)
+    second = view  # its eye is the mirror; distances along the first ray count for texture detail
+    second.eye = view.eye + ray * hit.t
+    towards = wp.normalize(ray - flat * (2.0 * wp.dot(flat, ray)))
+    second.eye += towards * 2.0e-3
+    found = nearest(shell, things, second.eye, towards)
+    if found.layer == 0:
+        seen = shade(shell, things.mesh, texels, levels, lights, second, towards, found, sample)
+        return seen.value
+    if found.layer == 1:
+        seen = shade(things, things.mesh, texels, levels, lights, second, towards, found, sample)
+        return seen.value
+    return wp.vec3(0.0, 0.0, 0.0)
 
 
 @wp.func

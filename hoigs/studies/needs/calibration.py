@@ -106,6 +106,7 @@ def calibrated(
     allowance: StepBudget,
     *,
     least: float,
+    moves: bool = False,
     what: str = "",
 ) -> Calibrated:
     """The cheapest candidate that the best is not ahead of by more than its freedom explains.
@@ -116,7 +117,8 @@ def calibrated(
         trials: of each candidate, cheapest first. costs: of a step of each. halving: of the trials;
             scores of those that are trained on are added. steps: of the trials that reached its
             end. allowance: entered before each training, as `what`. least: dB of gain that are
-            ignored in any case.
+            ignored in any case. moves: the clip's track says that the object moves; a model that
+            stands still contradicts it, and is taken only if it is as good.
     """
     finalists = [k for k, scores in enumerate(halving.scores) if steps in scores]
     best = max(finalists, key=lambda k: halving.scores[k][steps].mean)
@@ -125,6 +127,8 @@ def calibrated(
         seen, own, top = halving.last_common(k, best)
         found, errors = gain(top, own), 1.0
         if found.mean - found.error > OBVIOUS:
+            continue
+        if moves and found.mean > least and _stands_still(trials[k]):
             continue
         scoring = SCORING * len(own.psnr)
         pair = (costs[k] + costs[best]) * (steps + scoring)
@@ -140,6 +144,10 @@ def calibrated(
         if found.mean <= max(errors * found.error, least):
             return Calibrated(k, useless)
     return Calibrated(best, useless)
+
+
+def _stands_still(trial: Trial) -> bool:
+    return not any(trial.model.entity(name).deformation.moves for name in trial.names)
 
 
 def _useless(simple: Trial, rich: Trial, steps: int) -> list[float]:

@@ -63,6 +63,19 @@ def cheapest_refit(
 
 
 @torch.no_grad()
+def track_moves(clip: Clip, names: Sequence[str]) -> bool:
+    """Whether the clip's own track moves one of some objects visibly, by more than `UNSEEN`."""
+    screen = screen_of(clip)
+    for track in (clip.objects[name] for name in names if name in clip.objects):
+        some = track.points[:: max(1, len(track.points) // 200)]
+        points = some @ track.rotations.mT + track.translations[:, None]
+        still = points[len(points) // 2].expand_as(points)
+        if screen.deviation(screen.on_screen(points), screen.on_screen(still)) > UNSEEN:
+            return True
+    return False
+
+
+@torch.no_grad()
 def _held(
     curve: DeformationModel, cheaper: DeformationModel, canonical: Gaussians, screen: ScreenMotion
 ) -> bool:

@@ -25,6 +25,7 @@ from hoigs.studies.needs.result import (
     Step,
     cheapest_refit,
     summary_line,
+    track_moves,
 )
 from hoigs.studies.needs.search_space import (
     SCORING,
@@ -207,6 +208,7 @@ class Search:
                 found = calibrated(
                     [trials[candidate.name] for candidate in tried], costs, halving, rounds.steps,
                     allowance, least=least, what=what,
+                    moves=track_moves(self.clip, self._names(block)),
                 )  # fmt: skip
                 for entry in allowance.entries:
                     self.budget.spend(*entry)

@@ -13,6 +13,7 @@ from hoigs.core.spec.schema import Spec
 from hoigs.runs.clip_source import read_clip
 from hoigs.studies.needs import calibration
 from hoigs.studies.needs.calibration import as_if_true, calibrated
+from hoigs.studies.needs.result import track_moves
 from hoigs.studies.needs.search_space import Halving, Score, StepBudget, as_settings
 from hoigs.studies.needs.trial import SELECTION, Trial, isolated, region_of, selection_view
 
@@ -72,6 +73,27 @@ def test_what_gains_nothing_where_it_is_useless_is_needed() -> None:
 def test_without_an_allowance_a_gain_counts_as_it_is() -> None:
     found, budget = chosen(useless=score(20.9, 22.0, 23.0), allowance=1.0)
     assert found.chosen == 1 and not found.useless and budget.spent == 0
+
+
+def test_a_still_model_needs_more_than_silence_against_a_track_that_moves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    trials: Any = [Pretended(SIMPLE, SIMPLE), Pretended(RICH, score(20.9, 22.0, 23.0))]
+    monkeypatch.setattr(calibration, "_stands_still", lambda trial: trial is trials[0])
+    for moves in (False, True):
+        halving = Halving(0, ({4: SIMPLE}, {4: RICH, STEPS: RICH}))
+        found = calibrated(
+            trials, [0.5, 1.0], halving, STEPS, StepBudget(1e3), least=0.0, moves=moves
+        )
+        assert found.chosen == int(moves)
+
+
+@pytest.mark.parametrize("name, moves", [("still-box", False), ("glide", True)])
+def test_a_track_moves_or_not(name: str, moves: bool) -> None:
+    clip = read_clip(
+        f"builtin:{name}?frames=6&width=32&fps=2&samples=1&edge_samples=1&test_frames=2"
+    )
+    assert track_moves(clip, ["object"]) == moves
 
 
 def test_an_obvious_gain_costs_nothing() -> None:

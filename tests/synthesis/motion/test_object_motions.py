@@ -64,10 +64,19 @@ def test_a_pushed_box_stays_on_the_table() -> None:
     assert np.ptp(track.translations[:, 0]) > 0.4
 
 
-def test_only_a_bending_bar_bends() -> None:
+def test_only_a_bending_bar_bends_and_only_a_soft_ball_is_squeezed() -> None:
     for motion in MOTIONS:
-        bend = MOTIONS[motion](_config(motion)).script().bend
-        assert (np.abs(bend).max() > np.radians(50)) == (motion == "bending")
+        script = MOTIONS[motion](_config(motion)).script()
+        assert (np.abs(script.bend).max() > np.radians(50)) == (motion == "bending")
+        assert (script.squeeze.min() < 0.8) == (motion == "squeezed")
+        assert script.squeeze.max() == pytest.approx(1)
+
+
+def test_an_object_that_moves_alone_is_not_held() -> None:
+    config = SceneConfig.model_validate({"object": {"motion": "gliding", "alone": True}})
+    script = MOTIONS["gliding"](config).script()
+    assert script.grip.max() == 0 and np.ptp(script.hold.translations, axis=0).max() == 0
+    assert np.ptp(script.track.translations[:, 0]) > 0.4
 
 
 def test_a_static_object_never_moves() -> None:

@@ -11,6 +11,7 @@ from hoigs.synthesis import LightConfig, SyntheticScene
 from hoigs.synthesis.generate import unproject
 from hoigs.synthesis.meshes import TexturedMesh, box, quad
 from hoigs.synthesis.raycast import FINE, Layer, RayCaster, fine_barycentrics, pixel_samples
+from hoigs.synthesis.raycast_kernels import MIRROR
 from hoigs.synthesis.textures import TextureAtlas, to_srgb
 
 ROOM = ((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0))
@@ -219,3 +220,21 @@ def test_joined_meshes_keep_their_parts() -> None:
     both = TexturedMesh.join([a, b])
     assert len(both.faces) == 24 and both.faces.max() == 47
     assert (both.texture[:12] == 2).all() and (both.texture[12:] == 5).all()
+
+
+def test_a_mirror_shows_what_stands_behind_the_camera() -> None:
+    """Behind the camera stands a white wall at the left and a black one at the right."""
+    left = np.array([[0, 4, 4], [-4, 4, 4], [-4, -4, 4], [0, -4, 4.0]])
+    sides = [left, left + np.array([4, 0, 0])]
+    walls = [quad(corners, i) for i, corners in enumerate(sides)]
+    shell = Layer.build(TexturedMesh.join(walls), np.zeros(4, int))
+    atlas = TextureAtlas.pack([np.ones((4, 4, 3)), np.zeros((4, 4, 3))])
+    corners = np.array([[-1, 1, -1], [1, 1, -1], [1, -1, -1], [-1, -1, -1.0]])
+    mirror = Layer.build(quad(corners, 1), np.full(2, MIRROR))
+    camera = Camera.look_at(
+        torch.tensor([0.0, 0.0, 3.0]), torch.zeros(3), width=48, height=40, fov_y=0.4
+    )
+    shown = RayCaster(shell, atlas, DARK, ROOM, 1, 1, mirror=1.0).render(camera, mirror).color
+    dull = RayCaster(shell, atlas, DARK, ROOM, 1, 1).render(camera, mirror).color
+    assert shown[20, 4].min() > 0.2 and shown[20, 43].max() < 0.01
+    assert dull.max() < 0.01  # the mirror's own colour is black

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoigs.synthesis.meshes import TexturedMesh, ball, box, cylinder, lathe, smooth_normals
-from hoigs.synthesis.object_motions import bend_points, bent_mesh
+from hoigs.synthesis.object_motions import bend_points, deformed_mesh
 from hoigs.synthesis.room import Palette, Stand, build_room
 
 SOLIDS = {
@@ -80,17 +80,40 @@ def test_smooth_normals_of_a_ball_are_radial() -> None:
 
 def test_bending_keeps_the_middle_line_s_length_and_is_smooth_at_zero() -> None:
     line = np.stack((np.linspace(-0.3, 0.3, 400), np.zeros(400), np.zeros(400)), -1)
-    bent, rotation = bend_points(line, 3.0)
+    bent, rotation = bend_points(line, 1.8, 0.6)
     length = np.linalg.norm(np.diff(bent, axis=0), axis=-1).sum()
     assert length == pytest.approx(0.6, rel=1e-4)
     ends = np.degrees(np.arccos((np.trace(rotation[0].T @ rotation[-1]) - 1) / 2))
-    assert ends == pytest.approx(np.degrees(0.6 * 3.0), rel=1e-6)
-    np.testing.assert_allclose(bend_points(line, 1e-7)[0], line, atol=1e-7)
+    assert ends == pytest.approx(np.degrees(1.8), rel=1e-6)
+    np.testing.assert_allclose(bend_points(line, 1e-7, 0.6)[0], line, atol=1e-7)
 
 
-def test_a_bent_mesh_keeps_normals_on_its_surface() -> None:
-    mesh = bent_mesh(box((0.6, 0.1, 0.1), 0, columns=24), 2.0)
-    assert _against_winding(mesh).min() > 0.99
+def test_a_hinge_bends_at_its_middle_alone() -> None:
+    line = np.stack((np.linspace(-0.3, 0.3, 401), np.zeros(401), np.zeros(401)), -1)
+    bent, _ = bend_points(line, 1.2, 0.012)
+    steps = np.diff(bent, axis=0)
+    angle = np.arctan2(-steps[:, 2], steps[:, 0])
+    np.testing.assert_allclose(angle[:190], -0.6, atol=1e-6)
+    np.testing.assert_allclose(angle[-190:], 0.6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "bend, width, squeeze", [(1.2, 0.6, 1.0), (1.2, 0.012, 1.0), (0.0, 0.6, 0.7)]
+)
+def test_a_deformed_mesh_keeps_normals_on_its_surface(
+    bend: float, width: float, squeeze: float
+) -> None:
+    columns = 24 if width > 0.1 else 2  # more would cross at the inner side of a hinge
+    mesh = deformed_mesh(box((0.6, 0.1, 0.1), 0, columns), bend, width, squeeze)
+    assert _against_winding(mesh).min() > (0.99 if columns == 24 else 0.8)
+
+
+def test_a_squeezed_ball_keeps_its_volume_and_its_normals() -> None:
+    whole, soft = (deformed_mesh(ball(0.15, 0), 0.0, 0.3, squeeze) for squeeze in (1.0, 0.7))
+    volumes = [trimesh.Trimesh(m.vertices, m.faces).volume for m in (whole, soft)]
+    assert volumes[1] == pytest.approx(volumes[0], rel=1e-9)
+    assert np.ptp(soft.vertices[:, 0]) == pytest.approx(0.7 * np.ptp(whole.vertices[:, 0]))
+    assert _against_winding(soft).min() > 0.7
 
 
 def test_moving_a_mesh_moves_its_normals() -> None:
