@@ -13,7 +13,7 @@ from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_name, read_clip
 from hoigs.studies.needs.options import NeedsOptions
 from hoigs.studies.needs.report import require_new, write_needs
-from hoigs.studies.needs.result import QUICK, TOTAL, Needs, Settings
+from hoigs.studies.needs.result import QUICK, QUICK_STEPS, TOTAL, Needs, Settings
 from hoigs.studies.needs.search import Search
 from hoigs.studies.needs.search_space import load_search_spaces
 from hoigs.training.train import Report, silent
@@ -59,6 +59,7 @@ def needs(clip: Path | str, *, options: NeedsOptions, report: Report = silent) -
             options.least,
             share,
             budget=TOTAL if options.smallest else QUICK,
+            search_steps=None if options.smallest else QUICK_STEPS,
             smallest=options.smallest,
         ),
         registry,

@@ -23,7 +23,16 @@ from hoigs.core.spec.loader import load_overrides
 from hoigs.core.spec.schema import Spec
 from hoigs.core.system.files import name_from
 from hoigs.core.system.safe_replace import Layout, one_of, require_replaceable
-from hoigs.studies.needs.result import SETTLES, UNSEEN, Answer, Needs, Step, summary_line
+from hoigs.studies.needs.result import (
+    AFTER,
+    FINAL,
+    SETTLES,
+    UNSEEN,
+    Answer,
+    Needs,
+    Step,
+    summary_line,
+)
 from hoigs.studies.plots import DPI, MARKERS, PALETTE, STYLE, framed, scale
 
 # The answer as a readable spec: what it extends, and each changed key with a reason.
@@ -284,7 +293,7 @@ def method(needs: Needs) -> list[str]:
         f"the cheapest candidate within one standard error of the best, or within "
         f"{chosen.least:g} dB{_tolerances(needs)}"
     )
-    total = needs.full * chosen.budget
+    total = needs.budget.limit + (FINAL + AFTER) * needs.full
     frames = ", ".join(map(str, needs.frames))
     return [
         f"- Held back: {len(needs.frames)} training frames (positions {frames}). Test frames were "
@@ -297,7 +306,7 @@ def method(needs: Needs) -> list[str]:
         "for fewer steps, and are compared with the chosen one at that step.",
         f"- Search: {needs.budget.spent:.0f} of {needs.budget.limit:.0f} steps; "
         f"with the final training and pruning the limit is "
-        f"{chosen.budget:g} x {needs.full} = {total:.0f}. Wall time: {needs.seconds:.0f} s, "
+        f"{total / needs.full:.3g} x {needs.full} = {total:.0f}. Wall time: {needs.seconds:.0f} s, "
         f"where a full training would take about {needs.full_seconds:.0f} s "
         f"({needs.seconds / needs.full_seconds:.2f} of it).",
     ]

@@ -110,6 +110,7 @@ def _same_but_knots(one: object, other: object) -> bool:
 
 TOTAL = 2.5  # full trainings that search, final training and pruning may cost together
 QUICK = 1.8  # where the smallest model is not asked for
+QUICK_STEPS = 840  # that a search costs there at most: of 1,200 steps it was measured with
 FINAL, AFTER = 1.0, 0.1  # of these, for the final training and for pruning
 SETTLES = "train.rates.settle"
 SETTLE = 0.1  # of trials, answer and tuning: with constant rates the end of a training is noisy
@@ -123,6 +124,7 @@ class Settings:
         least: dB of gain that are ignored (`search_space.near_best`).
         share, frames: share of the training frames that is held back, and the least number.
         budget: full trainings that everything may cost, including the final training.
+        search_steps: of the full spec, that the search costs at most; None has no such bound.
         smallest: whether spaces that are for the smallest model only are searched.
     """
 
@@ -130,6 +132,7 @@ class Settings:
     share: float = 0.05
     frames: int = 3
     budget: float = TOTAL
+    search_steps: int | None = None
     smallest: bool = True
 
 

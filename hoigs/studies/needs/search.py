@@ -90,7 +90,8 @@ class Search:
         self.held = self.view.split[SELECTION]
         steps = full.train.steps
         self.most = steps
-        self.budget = StepBudget((self.settings.budget - FINAL - AFTER) * steps)
+        limit = (self.settings.budget - FINAL - AFTER) * steps
+        self.budget = StepBudget(min(limit, self.settings.search_steps or limit))
         self.blocks, self.entities = _blocks(full, self.clip)
         pace = self._pace()
         self.found: Overrides = {} if self._settled(full) else {SETTLES: SETTLE}

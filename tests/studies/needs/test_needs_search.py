@@ -13,8 +13,8 @@ from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip, FrameStore
 from hoigs.runs.clip_source import read_clip
 from hoigs.studies.needs import search as search_module
-from hoigs.studies.needs.report import FILES, as_data, page, require_new, row, write_needs
-from hoigs.studies.needs.result import SETTLE, SETTLES, Needs, summary_line
+from hoigs.studies.needs.report import FILES, as_data, method, page, require_new, row, write_needs
+from hoigs.studies.needs.result import SETTLE, SETTLES, Needs, Settings, summary_line
 from hoigs.studies.needs.search import Search
 from hoigs.studies.needs.search_space import Candidate, Score, SearchSpace
 from hoigs.studies.needs.trial import SealedFrameError, Trial, region_of, selection_view
@@ -180,6 +180,14 @@ def test_the_budget_is_kept(needs):
     paid = sum(step.candidate.cost * step.steps for step in trained)
     assert 0.8 * needs.budget.limit < needs.budget.spent <= needs.budget.limit
     assert paid < needs.budget.spent
+
+
+def test_a_long_training_is_not_searched_longer(clip):
+    settings = Settings(search_steps=40)
+    search = Search(clip, "hoigs", (OBJECT,), [*GIVEN, "train.steps=400"], settings)
+    found = search.run()
+    assert found.budget.limit == 40 and found.budget.spent <= 40
+    assert "1.2 x 400 = 480" in "\n".join(method(found))
 
 
 def test_the_answer_on_disk(needs, tmp_path):
