@@ -62,7 +62,7 @@ PLAN = {
         version=3,
     ),
     "object_masks": Stage(
-        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=6
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=7
     ),
     "cameras": Stage(
         3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration"), version=2

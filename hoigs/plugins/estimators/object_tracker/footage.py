@@ -31,6 +31,7 @@ BARE = (
     (24, 26), (26, 28), (7, 8),
 )  # fmt: skip
 THIN = 0.07  # radius of these, in torsos
+OF_SHOULDERS = 1.4  # torso length of an adult who faces the camera, in breadths of the shoulders
 SAMPLED = 12  # frames in which the body's colours are learnt
 
 
@@ -71,6 +72,12 @@ def torso_length(landmarks: Float[np.ndarray, "F 33 4"]) -> Float[np.ndarray, "F
         return length
     usual = np.nanquantile(length, 0.75)
     return np.fmax(length, 0.8 * usual)
+
+
+def shoulder_breadth(landmarks: Float[np.ndarray, "F 33 4"]) -> Float[np.ndarray, "F"]:
+    """Pixels between the shoulders; NaN where one is not seen."""
+    breadth = np.linalg.norm(np.subtract(*np.moveaxis(landmarks[:, SHOULDERS, :2], 1, 0)), axis=-1)
+    return np.where((landmarks[:, SHOULDERS, 3] >= SEEN).all(1), breadth, np.nan)
 
 
 def limbs(
@@ -177,8 +184,11 @@ def body_colors(
     footage: Footage, people: Sequence[Float[np.ndarray, "F 33 4"]]
 ) -> Float[np.ndarray, "B"] | None:
     """Colours along the limbs over the video, which a thing that is held covers now and then; None
-    where no torso is seen."""
-    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
+    where no shoulders are seen."""
+    lengths = [torso_length(p) for p in people]
+    if not any(np.isfinite(length).any() for length in lengths):
+        lengths = [OF_SHOULDERS * shoulder_breadth(p) for p in people]
+    lengths = np.concatenate([*lengths, [np.nan]])
     if not np.isfinite(lengths).any():
         return None
     torso, found = float(np.nanmedian(lengths)), []

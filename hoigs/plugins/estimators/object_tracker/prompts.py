@@ -64,6 +64,7 @@ GROWN = 0.97  # intersection over union with the growth before, from which it gr
 USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
 ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.75, 0.5  # share of the person's colours, and that no limb reaches: see below
+COMMON = 2.0  # times that a colour may be more frequent on a person than along their limbs
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
 WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18)  # of `_Judge.features`, by 83 clicks anywhere
 MOVING = np.array((0.3, 0.5))  # most that motion says: a part of what turns is set off, too
@@ -229,10 +230,13 @@ def looks_like_person(footage: Footage, found: PromptedMask) -> bool:
 
 
 def of_person(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
-    """The share of a mask's pixels for which the person has as many of their colour beside it."""
+    """The share of a mask's pixels for which the person has as many of their colour beside it, and
+    along their limbs: a mask of a person may have taken in other things that look alike."""
     rest = footage.person[i] & ~ndimage.binary_dilation(mask, iterations=2 * footage.unit)
     bins = bins_of(footage.colors(i))
     own, theirs = (region.sum() * histogram(bins, region * 1.0) for region in (mask, rest))
+    if footage.limbs is not None:
+        theirs = np.minimum(theirs, COMMON * rest.sum() * footage.limbs)
     return float(np.minimum(own, theirs).sum() / max(mask.sum(), 1))
 
 

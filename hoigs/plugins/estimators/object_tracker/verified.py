@@ -8,7 +8,7 @@ elsewhere, and where it did not jump. All other masks are dropped: none is bette
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +39,9 @@ CARRIED = 0.3  # and from which it is by the frames beside it, from which it doe
 SIZES = (0.3, 1.5)  # of its usual area about then: half hidden, and not with a thing beside it
 AROUND = 6  # proven frames before and after a frame that say what is usual
 STEP = 1.5  # diameters a frame beside what the motion foretells: farther is a jump
-BESIDE, ALONE = 0.6, (0.6, 1.4)  # of an object that has twins: its breadth, and its area before
+# of an object that has twins: how far beside its way it may be, in breadths; its area, of that
+# before; in distances of the nearest other; and frames that may be missed
+BESIDE, ALONE, CLEARLY, MISSED = 0.6, (0.6, 1.4), 0.5, 8
 SAME = 6.0  # units of colour within which a place looks as it did
 THERE = 0.7  # share of a mask that looks as it did while the object was elsewhere
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
@@ -102,8 +104,25 @@ def proof_of(
     area = masks.sum((1, 2)).astype(float)
     agreement[~_usual_size(area, agreement >= PROVEN, given)] = 0.0
     proven = agreement >= PROVEN
-    follow = _followed if known.twins else _continued
-    return Proof(agreement, follow(masks, agreement, proven, given))
+    if not known.twins:
+        return Proof(agreement, _continued(masks, agreement, proven, given))
+
+    def alike(i: int) -> Float[np.ndarray, "N 2"]:
+        return _middles_of_alike(looks, i, masks[i], masks[given[0]].sum())
+
+    return Proof(agreement, _followed(masks, agreement, alike, given))
+
+
+def _middles_of_alike(
+    looks: Appearance, i: int, mask: Bool[np.ndarray, "h w"], usual: float
+) -> Float[np.ndarray, "N 2"]:
+    """Middles x, y of what looks like the object beside its mask, and is no small part of one."""
+    own = ndimage.binary_dilation(mask, iterations=2 * looks.side)
+    labels, count = ndimage.label((looks.odds(i) > 0) & ~own)
+    rows = np.arange(1, count + 1)
+    large = rows[ndimage.sum_labels(np.ones(mask.shape), labels, rows) > SIZES[0] * usual]
+    middles = ndimage.center_of_mass(labels > 0, labels, large)
+    return np.array(middles).reshape(-1, 2)[:, ::-1] + 0.5
 
 
 @dataclass(frozen=True)
@@ -230,30 +249,52 @@ def _continued(
 def _followed(
     masks: Bool[np.ndarray, "F h w"],
     agreement: Float[np.ndarray, " F"],
-    proven: Bool[np.ndarray, " F"],
+    alike: Callable[[int], Float[np.ndarray, "N 2"]],
     given: list[int],
 ) -> Bool[np.ndarray, " F"]:
-    """Of an object that has twins: the frames up to which it was followed without a break.
+    """Of an object that has twins: the frames in which its way tells which of them is seen.
 
-    Looks do not tell which of them is seen, so that after one frame in which it is not, or goes
-    more than a part of its size beside its way, or takes in another, nothing does.
+    Looks do not tell. A mask is the object's where it lies on its way, and clearly nearer to that
+    than any other thing that looks alike. A few frames may be missed, as a hand may cover it; once
+    another thing comes to where it was last seen meanwhile, or too many are missed, nothing tells
+    any more which is which.
+
+    Args:
+        alike: of a frame, the middles x, y of things beside its mask that look like the object.
     """
     found = np.zeros(len(masks), bool)
     found[given] = True
     area = masks.sum((1, 2)).astype(float)
     for start in given:
         for step in (1, -1):
-            at, speed, usual = np.array(center_of(masks[start])), np.zeros(2), area[start]
+            at, speed, usual, last = (
+                np.array(center_of(masks[start])),
+                np.zeros(2),
+                area[start],
+                start,
+            )
             for i in range(start + step, len(masks) if step > 0 else -1, step):
-                if i in given or agreement[i] < CARRIED:
+                gap = abs(i - last)
+                if i in given or gap > MISSED:
                     break
-                moved = np.array(center_of(masks[i])) - at
-                off = np.hypot(*(moved - speed)) / np.sqrt(usual)
-                if off > BESIDE or not ALONE[0] < area[i] / usual < ALONE[1]:
-                    break
-                at, speed = at + moved, 0.5 * (speed + moved)
-                usual = 0.9 * usual + 0.1 * area[i]
-                found[i] = True
+                breadth = np.sqrt(usual)
+                fits = agreement[i] >= CARRIED and ALONE[0] < area[i] / usual < ALONE[1]
+                foretold = at + speed if gap == 1 else at  # nothing goes on evenly behind a hand
+                others = np.hypot(*(alike(i) - foretold).T).min(initial=np.inf)
+                if fits:
+                    moved = np.array(center_of(masks[i])) - at
+                    off = np.hypot(*(moved + at - foretold))
+                    if off <= min(BESIDE * breadth, CLEARLY * others):
+                        at, speed, last = (
+                            at + moved,
+                            0.5 * (speed + moved) if gap == 1 else 0 * at,
+                            i,
+                        )
+                        usual = 0.9 * usual + 0.1 * area[i]
+                        found[i] = True
+                        continue
+                if others < breadth or area[i] >= ALONE[1] * usual:
+                    break  # another thing is there, or was taken in
     return found
 
 

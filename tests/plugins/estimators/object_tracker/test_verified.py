@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,15 +96,21 @@ def test_a_frame_to_which_the_object_jumped_is_not_believed(places, believed) ->
     assert found.astype(int).tolist() == believed
 
 
-def test_of_equal_things_one_that_was_lost_or_grew_is_not_believed_again() -> None:
+def test_of_equal_things_the_one_on_its_way_is_believed() -> None:
     masks = np.stack([disc(20 + 4 * i, 40) for i in range(8)])
-    sure = np.full(8, 0.9)
-    assert _followed(masks, sure, sure > 0.5, [1]).all()
-    hidden = sure.copy()
+    sure, hidden = np.full(8, 0.9), np.full(8, 0.9)
     hidden[4] = 0.1
-    assert _followed(masks, hidden, hidden > 0.5, [1]).tolist() == [True] * 4 + [False] * 4
+
+    def others(*places: tuple[float, float]) -> Callable[[int], np.ndarray]:
+        return lambda i: np.array(places).reshape(-1, 2)
+
+    far, beside = others((90, 40)), others((34, 40))
+    assert _followed(masks, sure, others(), [1]).all()
+    # covered by a hand for a frame: which one it is is clear where no other is near
+    assert _followed(masks, hidden, far, [1]).tolist() == [True] * 4 + [False] + [True] * 3
+    assert _followed(masks, hidden, beside, [1]).tolist() == [True] * 4 + [False] * 4
     masks[5] |= disc(55, 40)  # takes in its neighbour
-    assert _followed(masks, sure, sure > 0.5, [1]).tolist() == [True] * 5 + [False] * 3
+    assert _followed(masks, sure, far, [1]).tolist() == [True] * 5 + [False] * 3
 
 
 def test_a_mask_that_takes_in_the_thing_beside_it_is_not_of_the_usual_size() -> None:
