@@ -57,6 +57,7 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_
 
 Model = Literal["pinhole", "ortho", "fisheye"]
 Shutter = Literal["global", "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left"]
+MODELS = get_args(Model)
 COEFFICIENTS = {"pinhole": (6, 2, 4), "ortho": (0, 0, 0), "fisheye": (4, 0, 0)}
 
 ALPHA, BETA, KAPPA = 0.1, 2.0, 0.0
