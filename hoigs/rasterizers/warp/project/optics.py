@@ -332,7 +332,7 @@ def onto_screen(
     axes = rotation * axes_of(quat, scale)
     places = Places()
     nearest = rest[2] + translation[2]
-    valid = 1
+    valid = wp.int32(1)
     for i in range(7):
         seen = seen_at(rest + offset_of(axes, i), translation, K)
         places[i, 0] = seen.place.p[0]
