@@ -383,7 +383,8 @@ def _draw(
         shape = (raw.means, raw.quats, raw.log_scales, raw.opacity_logits)
         return project(
             *shape, camera.world_to_camera, camera.K, camera.width, camera.height,
-            optics=camera.optics, near=request.near, low_pass=request.low_pass, antialiased=request.antialiased,
+            optics=camera.optics, near=request.near, low_pass=request.low_pass,
+            antialiased=request.antialiased,
         )  # fmt: skip
 
     subset = None
