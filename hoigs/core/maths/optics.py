@@ -124,7 +124,7 @@ class Optics:
     @property
     def needs(self) -> frozenset[str]:
         """What a rasterizer has to be able to draw: names of `Capabilities.optics`."""
-        names = {self.model} - {"pinhole"}
+        names: set[str] = {self.model} - {"pinhole"}
         if any((*self.radial, *self.tangential, *self.thin_prism)):
             names.add("distortion")
         if self.shutter != "global":
@@ -189,7 +189,7 @@ def _largest_slope(model: str, radial: tuple[float, ...]) -> float:
     return min(_smallest_root(growth), _smallest_root(below))
 
 
-def _smallest_root(polynomial: Sequence[float]) -> float:
+def _smallest_root(polynomial: Sequence[float] | np.ndarray) -> float:
     """The smallest positive root, coefficients in rising order; infinity without any."""
     roots = np.roots(np.trim_zeros(np.asarray(polynomial, np.float64), "b")[::-1])
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
