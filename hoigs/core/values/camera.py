@@ -134,11 +134,16 @@ class Camera:
     def _mapped_optics(self, change: Callable[[Tensor], Tensor]) -> Optics | None:
         return None if self.optics is None else self.optics.map_pose(change)
 
-    def _pinhole_only(self, what: str) -> None:
+    def need_pinhole(self, what: str) -> None:
+        """For code that knows K and the pose only.
+
+        Raises:
+            CameraError: the camera has optics; says that `what` is for pinholes.
+        """
         if self.optics is not None:
             raise CameraError(
-                f"Camera.{what} is for pinholes, and this camera has {self.optics}; undistort its "
-                "images, or leave `optics` out"
+                f"{what} is for pinholes, and this camera has {self.optics}; undistort its images, "
+                "or leave `optics` out"
             )
 
     def to_camera(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -176,7 +181,7 @@ class Camera:
         self, pixels: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch 3"]:
         """World points at pixels (x, y) and depths along z, metres."""
-        self._pinhole_only("unproject")
+        self.need_pinhole("Camera.unproject")
         xy = pinhole_rays(self.K, pixels) * depth[..., None]
         return self.to_world(torch.cat((xy, depth[..., None]), -1))
 
@@ -188,7 +193,7 @@ class Camera:
 
     def rays(self) -> Float[Tensor, "H W 3"]:
         """Unit directions in the world of what all pixels show, from `center`."""
-        self._pinhole_only("rays")
+        self.need_pinhole("Camera.rays")
         xy = pinhole_rays(self.K, self.pixel_grid())
         directions = (
             torch.cat((xy, torch.ones_like(xy[..., :1])), -1) @ self.world_to_camera[:3, :3]

@@ -15,6 +15,7 @@ from hoigs.core.interfaces.rasterizer import RenderRequest
 from hoigs.core.maths.optics import ALPHA, BETA, KAPPA, Optics, image_points
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_quats, slerp
 from hoigs.core.system.colmap import pycolmap
+from hoigs.core.values.between import blend_cameras
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.lens import Lens
@@ -286,6 +287,8 @@ def test_cameras_with_optics_move_and_scale_whole() -> None:
             camera.unproject(pixels, depth)
     with pytest.raises(CameraError, match="rolling"):
         a_camera(ROLLING).cropped(0, 0, 9, 9)
+    with pytest.raises(CameraError, match="blend_cameras"):
+        blend_cameras(a_camera(None), a_camera(ROLLING), 0.5)
     assert a_camera(ROLLING).to(torch.float32).optics.last_world_to_camera.dtype == torch.float32
 
 
