@@ -245,8 +245,11 @@ def _optics(
 
     last = bent["viewmats_rs"]
     poses = [None] * count if last is None else list(last.reshape(count, 4, 4))
-    columns = zip(*(numbers(name) for name in list(bent)[:3]), poses)
-    return [Optics(cast(Model, model), *row, shutter, pose) for *row, pose in columns]
+    columns = (numbers(f"{name}_coeffs") for name in ("radial", "tangential", "thin_prism"))
+    return [
+        Optics(cast(Model, model), k, p, s, shutter, pose)
+        for k, p, s, pose in zip(*columns, poses, strict=True)
+    ]
 
 
 def _color_shape(colors: Tensor, sh_degree: int | None) -> tuple[int, ...]:

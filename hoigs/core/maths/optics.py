@@ -124,7 +124,9 @@ class Optics:
     @property
     def needs(self) -> frozenset[str]:
         """What a rasterizer has to be able to draw: names of `Capabilities.optics`."""
-        names: set[str] = {self.model} - {"pinhole"}
+        names: set[str] = set()
+        if self.model != "pinhole":
+            names.add(self.model)
         if any((*self.radial, *self.tangential, *self.thin_prism)):
             names.add("distortion")
         if self.shutter != "global":
