@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -162,13 +162,13 @@ class InputValidation:
         Raises:
             RenderError: input that cannot be drawn.
         """
+        optics = getattr(camera, "optics", None)
+        plain = camera if optics is None else replace(camera, optics=None)
         key = tuple(
             (x.shape, x.dtype, x.device) if isinstance(x, Tensor) else x
-            for value in (gaussians, camera, request)
+            for value in (gaussians, plain, request)
             for x in getattr(value, "__dict__", {}).values()  # the check names other types
-            if not isinstance(x, Optics)
         )
-        optics = getattr(camera, "optics", None)
         if optics is not None:
             pose = optics.last_world_to_camera
             key += (optics.needs, None if pose is None else (pose.shape, pose.device))
