@@ -21,6 +21,7 @@ _PUBLIC = {
     "Gaussians": "hoigs.core.values.gaussians",
     "Moment": "hoigs.core.values.moment",
     "ObjectTrack": "hoigs.core.values.clip",
+    "Optics": "hoigs.core.maths.optics",
     "RenderOutput": "hoigs.core.interfaces.rasterizer",
     "RenderRequest": "hoigs.core.interfaces.rasterizer",
     "Residual": "hoigs.core.values.tokens",

@@ -19,6 +19,7 @@ from hoigs.core.interfaces.rasterizer import Rasterizer as Rasterizer
 from hoigs.core.interfaces.rasterizer import RenderOutput as RenderOutput
 from hoigs.core.interfaces.rasterizer import RenderRequest as RenderRequest
 from hoigs.core.interfaces.reader import ClipReader as ClipReader
+from hoigs.core.maths.optics import Optics as Optics
 from hoigs.core.model.compose import compose as compose
 from hoigs.core.model.entity import Entity as Entity
 from hoigs.core.model.exporter import Exported as _Exported

@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,6 +22,7 @@ from torch import Tensor
 
 from hoigs.core.errors import RenderError
 from hoigs.core.interfaces.rasterizer import Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.maths.optics import COEFFICIENTS, Model, Optics, Shutter
 from hoigs.core.maths.projection import LIMIT, Projection, project
 from hoigs.core.maths.spherical_harmonics import not_negative, sh_basis
 from hoigs.core.values.camera import Camera
@@ -32,11 +33,15 @@ __all__ = ["rasterization"]
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 MIN_ALPHA = 1.0 / 255.0  # gsplat's; a Gaussian's box is where its alpha is above it
 WIDEST_BOX = 3.33  # standard deviations
+# gsplat's RollingShutterType, by number
+SHUTTERS: tuple[Shutter, ...] = (
+    "top_to_bottom", "left_to_right", "bottom_to_top", "right_to_left", "global",
+)  # fmt: skip
 # arguments of gsplat's that other cameras, several machines or other primitives need
 UNSUPPORTED = (
-    "sparse_grad", "distributed", "covars", "with_ut", "with_eval3d", "radial_coeffs",
-    "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "lidar_coeffs", "rolling_shutter",
-    "viewmats_rs", "return_normals", "extra_signals",
+    "sparse_grad", "distributed", "covars", "with_eval3d", "ftheta_coeffs", "lidar_coeffs",
+    "external_distortion_coeffs", "return_normals", "extra_signals", "extra_signals_sh_degree",
+    "rays", "ut_params", "renderer_config",
 )  # fmt: skip
 
 
@@ -67,19 +72,27 @@ def rasterization(
     camera_model: str = "pinhole",
     segmented: bool = False,
     covars: Tensor | None = None,
+    with_ut: bool = False,
     *,
+    global_z_order: bool = True,
+    radial_coeffs: Float[Tensor, "*B C k"] | None = None,
+    tangential_coeffs: Float[Tensor, "*B C 2"] | None = None,
+    thin_prism_coeffs: Float[Tensor, "*B C 4"] | None = None,
+    rolling_shutter: int | Shutter = "global",
+    viewmats_rs: Float[Tensor, "*B C 4 4"] | None = None,
     rasterizer: Rasterizer | None = None,
     **others: Any,
 ) -> tuple[Float[Tensor, "*B C H W X"], Float[Tensor, "*B C H W 1"], dict[str, Any]]:
     """Draw Gaussians as seen by C cameras.
 
-    Gradients reach `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats` and `backgrounds`.
+    Gradients reach `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `viewmats_rs` and
+    `backgrounds`.
 
     Args:
         means: centres. quats: wxyz of any length. scales: standard deviations (activated).
         opacities: in [0, 1] (activated).
         colors: [*B, (C,) N, D], any numbers; with `sh_degree`, SH coefficients [*B, (C,) N, K, 3].
-        viewmats: world to camera, OpenCV axes. Ks: pinhole cameras, pixels.
+        viewmats: world to camera, OpenCV axes. Ks: pixels; of "ortho", pixels per metre.
         near_plane, far_plane: Gaussians whose centres are outside are culled.
         radius_clip: Gaussians whose box is not larger, in both directions, are culled; pixels.
         eps2d: variance added to the screen covariance, square pixels.
@@ -91,6 +104,12 @@ def rasterization(
         absgrad: `info["means2d"].absgrad` is filled in by the backward pass.
         rasterize_mode: "antialiased" as in Mip-Splatting.
         channel_chunk, segmented: change nothing here.
+        camera_model: "pinhole", "ortho" or "fisheye"; the last two always by the unscented
+            transform, as `with_ut` asks it of a pinhole (see `hoigs.core.maths.optics`).
+        radial_coeffs, tangential_coeffs, thin_prism_coeffs: OpenCV's; [*B, C, up to 6] and up to 4
+            for a fisheye. They are read to the host, which waits for a GPU, and have no gradient.
+        rolling_shutter, viewmats_rs: gsplat's `RollingShutterType`, or its name in lower case, and
+            the pose while the last row (or column) is exposed.
         rasterizer: what draws; `WarpRasterizer()` by default.
 
     Returns:
@@ -108,8 +127,25 @@ def rasterization(
             raise TypeError(f"rasterization() got an unexpected keyword argument {name!r}")
         if value is not None and value is not False:
             raise RenderError(f"rasterization: {name} is not supported; leave it out")
+    shutter = _shutter(rolling_shutter)
+    bent = {
+        "radial_coeffs": radial_coeffs,
+        "tangential_coeffs": tangential_coeffs,
+        "thin_prism_coeffs": thin_prism_coeffs,
+        "viewmats_rs": viewmats_rs,
+    }
+    if not global_z_order:
+        raise RenderError("rasterization: global_z_order=False is not supported; leave it out")
+    for name, value in bent.items():
+        if value is not None and not with_ut:
+            raise RenderError(f"rasterization: {name} needs with_ut=True, as in gsplat")
+    if (shutter == "global") != (viewmats_rs is None):
+        raise RenderError(
+            f"rasterization: rolling_shutter is {shutter!r} and viewmats_rs is "
+            f"{'not ' * (viewmats_rs is not None)}None; a rolling shutter needs both"
+        )
     for name, given, known in (
-        ("camera_model", camera_model, ("pinhole",)),
+        ("camera_model", camera_model, get_args(Model)),
         ("render_mode", render_mode, MODES),
         ("rasterize_mode", rasterize_mode, ("classic", "antialiased")),
     ):
@@ -126,6 +162,12 @@ def rasterization(
             "colors": (colors, (*(cameras,) * per_view, count, *_color_shape(colors, sh_degree))),
             "viewmats": (viewmats, (cameras, 4, 4)),
             "Ks": (Ks, (cameras, 3, 3)),
+            "viewmats_rs": (viewmats_rs, (cameras, 4, 4)),
+            **{
+                name: (value, (cameras, min(value.shape[-1], most)))
+                for (name, value), most in zip(bent.items(), COEFFICIENTS[camera_model])
+                if value is not None
+            },
             "backgrounds": (
                 backgrounds,
                 (cameras, 3 if sh_degree is not None else colors.shape[-1]),
@@ -136,6 +178,9 @@ def rasterization(
     scales = scales.clamp_min(torch.finfo(scales.dtype).tiny)
     raw = (means, quats, scales.log(), _Logit.apply(opacities), colors, viewmats, Ks)
     rows = [x.reshape(-1, *x.shape[len(batch) :]) for x in raw]
+    optics: list[Optics | None] = [None] * (math.prod(batch) * cameras)
+    if with_ut or camera_model != "pinhole":
+        optics = _optics(camera_model, shutter, bent, len(optics))
     images = [(b, c) for b in range(math.prod(batch)) for c in range(cameras)]
     screen = _Screen(means, cameras, absgrad)
     views: list[_View] = []
@@ -146,7 +191,7 @@ def rasterization(
                 rasterizer,
                 Gaussians(mean, quat, log_scale, logit, mean.new_zeros(count, 1, 3)),
                 color[c] if per_view else color,
-                Camera(K[c], view[c], width, height),
+                Camera(K[c], view[c], width, height, optics[image]),
                 RenderRequest(
                     near=near_plane,
                     low_pass=eps2d,
@@ -173,6 +218,38 @@ def rasterization(
     info = _Info(screen, views, (*batch, cameras, count), packed, tile_size)
     shape = (*batch, cameras, height, width, -1)
     return torch.cat(parts, -1).reshape(shape), alphas.reshape(shape), info
+
+
+def _shutter(given: int | str) -> Shutter:
+    """By gsplat's number, or by its name: "ROLLING_TOP_TO_BOTTOM" is "top_to_bottom"."""
+    if isinstance(given, int) and 0 <= given < len(SHUTTERS):
+        return SHUTTERS[given]
+    for name in SHUTTERS:
+        if str(given).lower().removeprefix("rolling_") == name:
+            return name
+    raise RenderError(
+        f"rasterization: rolling_shutter {given!r}, expected one of {', '.join(SHUTTERS)}"
+    )
+
+
+def _optics(
+    model: str, shutter: Shutter, bent: dict[str, Tensor | None], count: int
+) -> list[Optics | None]:
+    """Those of each image, in the order of batch and camera."""
+
+    def numbers(name: str) -> list[tuple[float, ...]]:
+        value = bent[name]
+        if value is None:
+            return [()] * count
+        return [tuple(row) for row in value.detach().reshape(count, -1).tolist()]
+
+    last = bent["viewmats_rs"]
+    poses = [None] * count if last is None else list(last.reshape(count, 4, 4))
+    columns = (numbers(f"{name}_coeffs") for name in ("radial", "tangential", "thin_prism"))
+    return [
+        Optics(cast(Model, model), k, p, s, shutter, pose)
+        for k, p, s, pose in zip(*columns, poses, strict=True)
+    ]
 
 
 def _color_shape(colors: Tensor, sh_degree: int | None) -> tuple[int, ...]:
@@ -309,12 +386,13 @@ def _draw(
         shape = (raw.means, raw.quats, raw.log_scales, raw.opacity_logits)
         return project(
             *shape, camera.world_to_camera, camera.K, camera.width, camera.height,
-            near=request.near, low_pass=request.low_pass, antialiased=request.antialiased,
+            optics=camera.optics, near=request.near, low_pass=request.low_pass,
+            antialiased=request.antialiased,
         )  # fmt: skip
 
     subset = None
     if far_plane < LIMIT:
-        view = camera.world_to_camera.detach()
+        view = camera.middle.world_to_camera.detach()
         subset = raw.means.detach() @ view[2, :3] + view[2, 3] <= far_plane
     if radius_clip > 0:
         wide = torch.zeros(len(raw), dtype=torch.bool, device=raw.means.device)
@@ -325,7 +403,7 @@ def _draw(
     if colored and sh_degree is None:
         features = colors
     elif colored and sh_degree == 4:
-        directions = torch.nn.functional.normalize(raw.means - camera.center, dim=-1)
+        directions = torch.nn.functional.normalize(raw.means - camera.middle.center, dim=-1)
         bases = sh_basis(directions, 4)
         features = not_negative(0.5 + (bases[:, :, None] * colors[:, : bases.shape[1]]).sum(1))
     elif colored and sh_degree is not None:

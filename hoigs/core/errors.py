@@ -27,7 +27,7 @@ class CheckpointError(HoigsError):
 
 
 class CameraError(HoigsError):
-    """A camera that is no pinhole: NaN, skew, or a pose that is not rigid; names the entry."""
+    """A broken camera: NaN, skew, a pose that is not rigid, or optics that do not exist."""
 
 
 class RenderError(HoigsError):

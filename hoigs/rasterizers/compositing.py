@@ -71,6 +71,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera, request: RenderReque
         camera.K,
         camera.width,
         camera.height,
+        optics=camera.optics,
         screen_offsets=None if offsets is None else offsets.to(dtype),
         drawable=drawable,
         near=request.near,
@@ -87,8 +88,9 @@ def prepare(
     camera = camera.to(gaussians.means.dtype)
     shown = project_gaussians(gaussians, camera, request)
     colors = sh_to_colors(
-        gaussians.sh[shown.index], gaussians.means[shown.index], camera.center, request.sh_degree
-    )
+        gaussians.sh[shown.index], gaussians.means[shown.index], camera.middle.center,
+        request.sh_degree,
+    )  # fmt: skip
     channels = [colors, shown.depths[:, None]]
     if request.features is not None:
         channels.append(request.features[shown.index].to(colors.dtype))

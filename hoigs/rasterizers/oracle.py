@@ -8,7 +8,13 @@ import torch
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import (
+    OPTICS,
+    Capabilities,
+    Rasterizer,
+    RenderOutput,
+    RenderRequest,
+)
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.compositing import blend, prepare, to_output
@@ -37,6 +43,7 @@ class OracleRasterizer(Rasterizer):
         camera_gradients=True,
         deterministic=True,
         absolute_gradients=True,
+        optics=OPTICS,
     )
 
     def __init__(self, config: OracleConfig | None = None) -> None:

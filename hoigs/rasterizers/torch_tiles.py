@@ -10,7 +10,13 @@ from pydantic import Field
 from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
-from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import (
+    OPTICS,
+    Capabilities,
+    Rasterizer,
+    RenderOutput,
+    RenderRequest,
+)
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.compositing import Splats, blend, prepare, squared_distances, to_output
@@ -35,6 +41,7 @@ class TorchRasterizer(Rasterizer):
         camera_gradients=True,
         deterministic=True,
         absolute_gradients=True,
+        optics=OPTICS,
     )
 
     def __init__(self, config: TorchConfig | None = None) -> None:

@@ -348,6 +348,7 @@ class Playback:
 
     def _pack(self, moment: Moment, camera: Camera) -> Tensor:
         """View matrix [16], intrinsics [9], time and poses in one tensor, on the CPU."""
+        camera.need_pinhole("Playback")
         return self._layout.pack(moment, camera.world_to_camera, camera.K)
 
     def _moment(self, lane: _Lane) -> Moment:

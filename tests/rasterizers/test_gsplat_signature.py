@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import pytest
@@ -17,7 +18,9 @@ from gsplat_twin import (
 from torch import Tensor
 
 from hoigs.core.errors import RenderError
+from hoigs.core.maths.rotations import axis_angle_to_matrices, quats_to_matrices
 from hoigs.gsplat import rasterization
+from hoigs.rasterizers.oracle import OracleRasterizer
 
 WIDTH, HEIGHT, CAMERAS, COUNT = 50, 38, 2, 60
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
@@ -175,9 +178,15 @@ def test_culling_by_distance_and_size() -> None:
 @pytest.mark.parametrize(
     "other",
     [
-        {"camera_model": "fisheye"}, {"covars": torch.eye(3).expand(COUNT, 3, 3)},
-        {"distributed": True}, {"sparse_grad": True}, {"with_ut": True}, {"render_mode": "N"},
+        {"camera_model": "ftheta"}, {"covars": torch.eye(3).expand(COUNT, 3, 3)},
+        {"distributed": True}, {"sparse_grad": True}, {"with_eval3d": True}, {"render_mode": "N"},
         {"sh_degree": 5}, {"quats": torch.ones(COUNT, 3)}, {"backgrounds": torch.zeros(3)},
+        {"radial_coeffs": torch.zeros(CAMERAS, 6)},
+        {"radial_coeffs": torch.zeros(CAMERAS, 6), "camera_model": "fisheye", "with_ut": True},
+        {"thin_prism_coeffs": torch.zeros(CAMERAS, 4), "camera_model": "ortho", "with_ut": True},
+        {"viewmats_rs": torch.eye(4).expand(CAMERAS, 4, 4), "with_ut": True},
+        {"rolling_shutter": 0, "with_ut": True}, {"rolling_shutter": "sideways"},
+        {"global_z_order": False}, {"ut_params": object()},
     ],
 )  # fmt: skip
 def test_what_is_not_supported_is_named(other: dict[str, Any]) -> None:
@@ -185,6 +194,131 @@ def test_what_is_not_supported_is_named(other: dict[str, Any]) -> None:
         rasterization(**{**scene(), **other})
     with pytest.raises(TypeError, match="sh_degre'"):
         rasterization(**scene(), sh_degre=3)
+
+
+FISHEYE = torch.tensor([[0.05, -0.02, 0.01, -0.003], [0.0, 0.03, 0.0, 0.0]])
+LENSES: dict[str, dict[str, Any]] = {
+    "pinhole": {"with_ut": True},
+    "ortho": {"camera_model": "ortho"},
+    "fisheye": {"camera_model": "fisheye"},
+    "distorted fisheye": {"camera_model": "fisheye", "with_ut": True, "radial_coeffs": FISHEYE},
+    "distorted": {
+        "with_ut": True,
+        "radial_coeffs": torch.tensor([[-0.2, 0.05, 0, 0.01, 0, 0], [0.1, 0, 0, 0, 0, 0]]),
+        "tangential_coeffs": torch.tensor([[0.004, -0.006], [0.0, 0.01]]),
+        "thin_prism_coeffs": torch.tensor([[0.01, -0.004, 0.006, 0.003], [0.0] * 4]),
+    },
+}
+
+
+def places(points: Tensor, K: Tensor, lens: dict[str, Any], c: int) -> Tensor:
+    """gsplat's and OpenCV's formulas, written out."""
+    x, y, z = points.unbind(-1)
+    if lens.get("camera_model") == "ortho":
+        return points[..., :2] * K.diagonal()[:2] + K[:2, 2]
+    none = torch.zeros(2, 6).to(points)
+    k = lens.get("radial_coeffs", none)[c].to(points)
+    p = lens.get("tangential_coeffs", none)[c].to(points)
+    s = lens.get("thin_prism_coeffs", none)[c].to(points)
+    if lens.get("camera_model") == "fisheye":
+        r = (x * x + y * y).sqrt()
+        theta = torch.atan2(r, z)
+        bent = theta * (1 + sum(k[i] * theta ** (2 * i + 2) for i in range(4)))
+        a, b = bent * x / r, bent * y / r
+    else:
+        a, b = x / z, y / z
+        r2 = a * a + b * b
+        gain = (1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3) / (
+            1 + k[3] * r2 + k[4] * r2**2 + k[5] * r2**3
+        )
+        a, b = (
+            gain * a + 2 * p[0] * a * b + p[1] * (r2 + 2 * a * a) + s[0] * r2 + s[1] * r2**2,
+            gain * b + p[0] * (r2 + 2 * b * b) + 2 * p[1] * a * b + s[2] * r2 + s[3] * r2**2,
+        )
+    return torch.stack((a, b), -1) * K.diagonal()[:2] + K[:2, 2]
+
+
+def unscented_image(given: dict[str, Any], lens: dict[str, Any], c: int) -> tuple[Tensor, Tensor]:
+    """Seven weighted points (alpha 0.1, beta 2, kappa 0) in float64, then gsplat's compositing."""
+    means, quats, scales, view = (
+        given[name].double() for name in ("means", "quats", "scales", "viewmats")
+    )
+    rotation, K = view[c, :3, :3], given["Ks"][c].double()
+    axes = (quats_to_matrices(quats) * scales[:, None]).mT * math.sqrt(0.03)
+    points = torch.cat((means[:, None], means[:, None] + axes, means[:, None] - axes), 1)
+    uv = places(points @ rotation.mT + view[c, :3, 3], K, lens, c)
+    weights = torch.tensor([-99.0, *[0.5 / 0.03] * 6], dtype=torch.float64)
+    center = (weights[:, None] * uv).sum(1)
+    weights = weights + torch.tensor([1 - 0.01 + 2, *[0.0] * 6], dtype=torch.float64)
+    off = uv - center[:, None]
+    cov = (weights[:, None, None] * off[..., None] * off[..., None, :]).sum(1)
+    cov = cov + 0.3 * torch.eye(2).double()
+    inverse = torch.linalg.inv(cov)
+    conics = torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), -1)
+    depths = (means @ rotation.mT + view[c, :3, 3])[:, 2]
+    reach = (2 * (given["opacities"].detach() * 255).clamp_min(1).log()).sqrt().clamp_max(3.33)
+    radii = (reach[:, None] * cov.detach().diagonal(dim1=1, dim2=2).sqrt()).ceil()
+    size = torch.tensor([WIDTH, HEIGHT])
+    shown = (depths > 0.01) & (given["opacities"] >= 1 / 255)
+    shown &= ((center + radii > 0) & (center - radii < size)).all(-1)
+    mean2d, conic, radius = (x[None, shown].float() for x in (center, conics, radii))
+    tiles = (-(-WIDTH // 16), -(-HEIGHT // 16))
+    _, keys, members = isect_tiles(
+        mean2d.detach(), radius.int(), depths[None, shown].float().detach(), 16, *tiles
+    )
+    image, alpha = rasterize_to_pixels(
+        mean2d, conic, given["colors"][None, shown], given["opacities"][None, shown], WIDTH, HEIGHT,
+        16, isect_offset_encode(keys, 1, *tiles), members,
+    )  # fmt: skip
+    return image[0] + (1 - alpha[0]) * given["backgrounds"][c], alpha[0]
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_cameras_that_are_no_pinhole(name: str) -> None:
+    lens, given = LENSES[name], scene(sh=None)
+    given["means"] = (given["means"].detach() * torch.tensor([1.5, 1.5, 1.0])).requires_grad_()
+    if name == "ortho":
+        given["Ks"] = given["Ks"] * torch.tensor([[0.3, 1, 1], [1, 0.3, 1], [1, 1, 1]])
+    images, alphas, info = rasterization(**given, **lens)
+    want = [torch.stack(x) for x in zip(*(unscented_image(given, lens, c) for c in range(CAMERAS)))]
+    torch.testing.assert_close(images, want[0], atol=5e-5, rtol=1e-4)
+    torch.testing.assert_close(alphas, want[1], atol=5e-5, rtol=1e-4)
+    assert info["conics"].isfinite().all() and (info["radii"] > 0).any()
+    weights = torch.randn_like(images)
+    leaves = [given[name] for name in INPUTS]
+    ours = torch.autograd.grad((images * weights).sum(), leaves)
+    theirs = torch.autograd.grad((want[0] * weights).sum(), leaves)
+    for field, a, b in zip(INPUTS, ours, theirs):
+        assert (a - b).norm() <= 5e-4 * b.norm() + 1e-6, field
+
+
+def test_rolling_shutters_are_of_each_camera() -> None:
+    """Batches, a motion of each camera, and the gradient of the last pose; as the oracle draws."""
+    given = scene((2,), sh=2)
+    torch.manual_seed(4)
+    motion = axis_angle_to_matrices(0.05 * torch.randn(2, CAMERAS, 3))
+    last = given["viewmats"].detach().clone()
+    last[..., :3, :3] = motion @ last[..., :3, :3]
+    last[..., :3, 3] += 0.1 * torch.randn(2, CAMERAS, 3)
+    last.requires_grad_()
+    rolling = {
+        "with_ut": True,
+        "camera_model": "fisheye",
+        "viewmats_rs": last,
+        "rolling_shutter": 2,
+    }
+    leaves = [last, given["viewmats"], given["means"]]
+    found = []
+    for rasterizer in (None, OracleRasterizer(OracleRasterizer.Config(cutoffs=True))):
+        images, _, _ = rasterization(**given, **rolling, rasterizer=rasterizer)
+        torch.manual_seed(5)
+        weighted = (images * torch.randn(images.shape)).sum()
+        found.append((images, *torch.autograd.grad(weighted, leaves)))
+    torch.testing.assert_close(found[0][0], found[1][0].float(), atol=2e-5, rtol=1e-4)
+    for a, b in zip(found[0][1:], found[1][1:]):
+        assert (a - b).norm() <= 5e-4 * b.norm()
+    still, _, _ = rasterization(**given, camera_model="fisheye")
+    assert (still - found[0][0]).abs().max() > 0.05
 
 
 @pytest.mark.parametrize(("absgrad", "packed"), [(False, False), (True, True)])

@@ -320,6 +320,7 @@ rasterizer.render(random_scene(10), a_camera())
     "name",
     [
         "project.kernels",
+        "project.optics",
         "project.spherical_harmonics_adjoint",
         "intersect.cuda_kernels",
         "blend.pixel_kernels",

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
 import torch
-from raster_scenes import RAW, a_camera, assert_close_gradient, images, random_scene
+from raster_scenes import RAW, a_camera, assert_close_gradient, forged, images, random_scene
 from torch import Tensor
 
 from hoigs.core.errors import RenderError
 from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.maths.optics import Optics
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
@@ -247,3 +249,54 @@ def test_a_captured_render_refuses_other_sizes() -> None:
         draw(camera=a_camera(151, 90).to(CUDA))
     with pytest.raises(RenderError, match=r"3000, 3.*100, 3"):
         draw(gaussians=gaussians[:100])
+
+
+def rolling(optics: Optics | None = None, turn: float = 0.04) -> Camera:
+    """A camera whose last row is seen from another pose; its numbers are on the GPU."""
+    camera = a_camera(150, 90)
+    last = camera.moved(torch.tensor([0.0, turn, 0.02]), torch.tensor([0.1, 0.0, -0.05]))
+    fisheye = Optics(
+        "fisheye", (0.05, -0.02, 0.01, -0.003), shutter="top_to_bottom",
+        last_world_to_camera=last.world_to_camera,
+    )  # fmt: skip
+    return replace(camera, optics=optics or fisheye).to(CUDA)
+
+
+def test_a_step_through_optics_waits_for_nothing_and_is_that_of_the_cpu() -> None:
+    gaussians, camera = random_scene(3000).to(CUDA), rolling()
+    rasterizer = WarpRasterizer()
+    request = RenderRequest(min_alpha=0.0, min_transmittance=0.0)
+
+    def step(device: torch.device) -> tuple[Tensor, ...]:
+        leaves = gaussians.map(lambda x: x.detach().to(device).requires_grad_())
+        poses = [camera.world_to_camera, camera.optics.last_world_to_camera]
+        poses = [x.detach().to(device).requires_grad_() for x in poses]
+        view = forged(
+            camera.to(device), world_to_camera=poses[0],
+            optics=replace(camera.optics, last_world_to_camera=poses[1]),
+        )  # fmt: skip
+        output = rasterizer.render(leaves, view, request)
+        output.color.backward(torch.ones_like(output.color))
+        return output.color.detach(), leaves.means.grad, leaves.quats.grad, *(x.grad for x in poses)
+
+    wanted = step(CUDA)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        actual = step(CUDA)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert all(torch.equal(a, b) for a, b in zip(actual, wanted))
+    for number, (a, b) in enumerate(zip(actual, step(torch.device("cpu")))):
+        assert_close_gradient(str(number), a.cpu(), b)
+
+
+def test_a_captured_render_follows_its_optics() -> None:
+    gaussians, camera = random_scene(3000).to(CUDA), rolling()
+    rasterizer = WarpRasterizer()
+    draw = rasterizer.capture(gaussians, camera)
+    bent = Optics(radial=(-0.2, 0.03), tangential=(0.01, 0.0))
+    for view in (camera, rolling(turn=-0.05), rolling(bent), rolling(Optics("fisheye"))):
+        assert torch.equal(draw(camera=view).color, rasterizer.render(gaussians, view).color)
+    assert draw.captures == 1
+    with pytest.raises(RenderError, match="optics"):
+        draw(camera=replace(camera, optics=None))

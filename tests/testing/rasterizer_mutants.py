@@ -130,6 +130,17 @@ class Accepting(Mutant):
             self.capabilities = declared
 
 
+class AnyLens(Mutant):
+    """Draws every camera as a pinhole."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda g, c, r: (g, replace(c, optics=None), r), optics=frozenset())
+
+    def check_inputs(self, gaussians: Any, camera: Any, request: Any) -> None:
+        plain = replace(camera, optics=None) if getattr(camera, "optics", None) else camera
+        super().check_inputs(gaussians, plain, request)
+
+
 class BrighterCopies(Mutant):
     gain = 1.0
 
@@ -295,7 +306,9 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
     )),
     "R23": ("AllHarmonics", lambda: on_request(lambda r, g: {"sh_degree": None})),
     "R24": ("FaintIsNothing", lambda: on_rows(lambda g, c, r: hidden(g, g.opacity_logits < -5.4))),
-    "R25": ("MirroredBehind", lambda: on_rows(mirrored_behind)),
+    "R25": ("MirroredBehind", lambda: on_rows(
+        lambda g, c, r: mirrored_behind(g, c, r) if c.optics is None else g
+    )),
     "R26": ("CulledByItsCentre", lambda: on_rows(lambda g, c, r: hidden(g, outside(g, c, 2.0)))),
     "R27": ("ThirtyTwoChannels", lambda: per_channel(lambda count: torch.arange(count) < 32)),
     "R30": ("RadiiKnowTheirRow", lambda: on_output(
@@ -353,7 +366,7 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
         else {"absolute_gradients": scaled_gradient(r.absolute_gradients)}
     )),
     "R52": ("HalfAScaleGradientOfDiscs", lambda: on_rows(
-        lambda g, c, r: g if not r.antialiased or len(g) == 1
+        lambda g, c, r: g if not r.antialiased or len(g) == 1 or c.optics is not None
         else g.replace(log_scales=scaled_gradient(g.log_scales))
     )),
     "R53": ("BlackStaysBlack", lambda: on_rows(
@@ -383,6 +396,13 @@ MUTANTS: dict[str, tuple[str, Callable[[], Rasterizer]]] = {
     "R66": ("InfiniteLogitIsNothing", lambda: on_rows(
         lambda g, *_: hidden(g, g.opacity_logits.isinf())
     )),
+    "R70": ("DeeperThroughALens", lambda: on_output(
+        lambda o, g, c, r: {} if c.optics is None else {"depth": o.depth + 1e-3}
+    )),
+    "R71": ("HalfAScaleGradientThroughALens", lambda: Mutant(lambda g, c, r: (
+        g if c.optics is None else g.replace(log_scales=scaled_gradient(g.log_scales)), c, r
+    ))),
+    "R72": ("TakesAnyLens", AnyLens),
     "R80": ("DicedGradient", lambda: on_rows(
         lambda g, *_: g.replace(sh=scaled_gradient(g.sh, 1 + 3e-5 * torch.rand(1)))
         if single(g) else g

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -43,9 +43,14 @@ class Remembering(Rasterizer):
         asked = [name for name in ASKED if getattr(request, name) is not None]
         inputs = [getattr(gaussians, name) for name in RAW]
         inputs += [camera.world_to_camera, *(getattr(request, name) for name in asked)]
+        optics = camera.optics
+        if optics is not None and optics.last_world_to_camera is not None:
+            inputs.append(optics.last_world_to_camera)
 
         def draw(*x: Tensor) -> RenderOutput:
             view = forged(camera, world_to_camera=x[len(RAW)])
+            if len(x) > len(RAW) + 1 + len(asked) and optics is not None:
+                view = forged(view, optics=replace(optics, last_world_to_camera=x[-1]))
             values = dict(zip(asked, x[len(RAW) + 1 :]))
             return TorchRasterizer().render(
                 Gaussians(*x[: len(RAW)]), view, request.replace(**values)
@@ -54,6 +59,8 @@ class Remembering(Rasterizer):
         values = [getattr(request, f.name) for f in fields(request)]
         others = [camera.K, *([] if request.subset is None else [request.subset])]
         numbers = [value for value in values if not isinstance(value, Tensor)]
+        if optics is not None:
+            numbers += [optics.model, optics.shutter, *optics.coefficients]
         key = (camera.width, camera.height, *numbers, *asked, bits(*inputs, *others))
         if key not in KEPT:
             with torch.no_grad():

@@ -16,6 +16,9 @@ from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 
+# all that `Camera.optics` may need of a rasterizer
+OPTICS = frozenset({"unscented", "ortho", "fisheye", "distortion", "rolling_shutter"})
+
 
 @dataclass(frozen=True)
 class Capabilities:
@@ -26,6 +29,8 @@ class Capabilities:
         camera_gradients: whether gradients reach `Camera.world_to_camera`.
         deterministic: whether two runs agree bit for bit.
         absolute_gradients: whether `RenderRequest.absolute_gradients` is filled in.
+        optics: what of `Camera.optics` it draws: "unscented", "ortho", "fisheye", "distortion",
+            "rolling_shutter"; nothing: pinholes with a global shutter only.
         fixed: options of a request that the backend cannot change, with their only value.
         image_error: largest error of an image against float64 away from cut-offs (depth: in parts
             of its largest value).
@@ -37,6 +42,7 @@ class Capabilities:
     camera_gradients: bool
     deterministic: bool
     absolute_gradients: bool = False
+    optics: frozenset[str] = frozenset()
     fixed: Mapping[str, float] = field(default_factory=dict, hash=False)
     image_error: float = 1e-5
     gradient_error: float = 1e-4
@@ -164,6 +170,12 @@ class Rasterizer(Configurable, ABC):
             )
         if camera.width < 1 or camera.height < 1:
             raise RenderError(f"{name}: image size {camera.width}x{camera.height} is empty")
+        needed = frozenset() if camera.optics is None else camera.optics.needs
+        if missing := sorted(needed - self.capabilities.optics):
+            raise RenderError(
+                f"{name}: cannot draw a camera with {' and '.join(missing)} (camera.optics); "
+                "use a rasterizer that can, for example rasterizer:warp"
+            )
         if request.absolute_gradients is not None and not self.capabilities.absolute_gradients:
             raise RenderError(
                 f"{name}: cannot compute absolute screen gradients (request.absolute_gradients); "
@@ -225,6 +237,10 @@ def _expected_shapes(
         "gaussians.sh": (gaussians.sh, [(count, bands, 3) for bands in (1, 4, 9, 16)]),
         "camera.K": (camera.K, [(3, 3)]),
         "camera.world_to_camera": (camera.world_to_camera, [(4, 4)]),
+        "camera.optics.last_world_to_camera": (
+            None if camera.optics is None else camera.optics.last_world_to_camera,
+            [(4, 4)],
+        ),
         "request.features": (request.features, [(count, None)]),
         "request.subset": (request.subset, [(count,)]),
         "request.screen_offsets": (request.screen_offsets, [(count, 2)]),

@@ -18,6 +18,10 @@ backends agree exactly on the following.
     opacity = sigmoid(opacity_logit)                                  as in 3DGS, or, antialiased,
     opacity = sigmoid(opacity_logit) |m0 x m1| / sqrt(det)            Mip-Splatting's 2D filter
 
+A camera with `optics` (fisheye, orthographic, distorted, rolling shutter) has means2d and the
+screen covariance without low_pass by the unscented transform, see `hoigs.core.maths.optics`, in
+float64; all that follows is the same.
+
 With the principal point in the middle the clamp is 3DGS's 1.3 tan(fov / 2). It bounds only the
 Jacobian, never (u, v), and its gradient is clamp's: none to x / z outside the limits.
 
@@ -31,6 +35,7 @@ where c >= -BLACK = -1e-6, else zero: black learns, also where rounding puts it 
     logits of +infinity and -infinity: opacities of 1 and 0, with a gradient of zero;
   - |quat| is outside [1e-8, 1e8] (the zero quaternion);
   - z <= near, or one of |x|, |y|, z, the scales, |u| or |v| exceeds LIMIT = 1e10;
+  - the camera has optics, by which one of its seven points has no place on the image;
   - not xx + yy <= MAX_VARIANCE = 1e12 (overflow), or not det >= MIN_DETERMINANT = 1e-12;
   - min_alpha > 0 and opacity < min_alpha;
   - min_alpha > 0 and its box misses the image: u + hu < 0, u - hu > W, v + hv < 0 or v - hv > H,
@@ -56,12 +61,15 @@ In float32, d^T conic d of a long thin splat is best taken as the sum of two squ
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hoigs.core.maths.optics import Optics, unscented
 from hoigs.core.maths.rotations import quats_to_matrices
 
 LIMIT = 1e10  # metres or pixels; beyond this a row counts as not finite
@@ -109,6 +117,7 @@ def project(
     width: int,
     height: int,
     *,
+    optics: Optics | None = None,
     screen_offsets: Float[Tensor, "N 2"] | None = None,
     drawable: Bool[Tensor, " N"] | None = None,
     near: float = 0.05,
@@ -124,13 +133,26 @@ def project(
     Args:
         means, quats, log_scales, opacity_logits: raw space, world.
         world_to_camera, K, width, height: the camera; the tensors in the dtype of the means.
+        optics: None for a pinhole with a global shutter, by EWA.
         screen_offsets: added to the projected means, pixels.
         drawable: rows that are not culled for other reasons than their geometry and opacity.
         near: metres. low_pass: square pixels. antialiased: opacities make up for `low_pass`.
         min_alpha: 0 means no cut-off.
     """
+    dtype = means.dtype
+    if optics is None:
+        onto_screen: Callable[..., _OnScreen] = _onto_screen
+        camera: tuple[Any, ...] = (world_to_camera, K, K.new_tensor([width, height]), low_pass)
+    else:
+        onto_screen = _through_optics
+        means, quats, log_scales = (x.double() for x in (means, quats, log_scales))
+        opacity_logits, world_to_camera, K = (
+            x.double() for x in (opacity_logits, world_to_camera, K)
+        )
+        screen_offsets = None if screen_offsets is None else screen_offsets.double()
+        camera = (*optics.middle(world_to_camera), K, (width, height), low_pass, optics, near)
+    size = K.new_tensor([width, height])
     rows = (means, quats, log_scales, screen_offsets)
-    camera = (world_to_camera, K, K.new_tensor([width, height]), low_pass)
     with torch.no_grad():
         keep = torch.stack([torch.isfinite(x).all(-1) for x in rows if x is not None]).all(0)
         keep &= ~opacity_logits.isnan()
@@ -139,9 +161,10 @@ def project(
         norms = quats.norm(dim=-1)
         keep &= (norms >= QUAT_NORMS[0]) & (norms <= QUAT_NORMS[1])
         keep &= (log_scales.exp() <= LIMIT).all(-1)
-        cam, means2d, covs, area, det = _onto_screen(
+        cam, means2d, covs, area, det, seen = onto_screen(
             means, quats, log_scales, screen_offsets, *camera
         )
+        keep &= seen
         keep &= (cam[:, 2] > near) & (cam.abs() <= LIMIT).all(-1)
         keep &= (means2d.abs() <= LIMIT).all(-1)
         keep &= (covs[:, 0] + covs[:, 2] <= MAX_VARIANCE) & (det >= MIN_DETERMINANT)
@@ -151,10 +174,10 @@ def project(
                 opacities = opacities * area / det.sqrt()
             extents = _extents(covs, opacities, min_alpha)
             keep &= opacities >= min_alpha
-            keep &= ((means2d + extents >= 0) & (means2d - extents <= camera[2])).all(-1)
+            keep &= ((means2d + extents >= 0) & (means2d - extents <= size)).all(-1)
         index = keep.nonzero().squeeze(1)
     offsets = screen_offsets if screen_offsets is None else screen_offsets[index]
-    cam, means2d, covs, area, det = _onto_screen(
+    cam, means2d, covs, area, det, _ = onto_screen(
         means[index], quats[index], log_scales[index], offsets, *camera
     )
     opacities = torch.sigmoid(opacity_logits[index])
@@ -166,7 +189,13 @@ def project(
         largest = 0.5 * (xx + yy) + (0.25 * (xx - yy).square() + xy.square()).sqrt()
         radii = (3.0 * largest.sqrt()).ceil()
         extents = _extents(covs, opacities, min_alpha)
-    return Projection(index, means2d, cam[:, 2], covs, conics, opacities, extents, radii)
+    found = (means2d, cam[:, 2], covs, conics, opacities, extents, radii)
+    return Projection(index, *(x.to(dtype) for x in found))
+
+
+# Camera-space centres [M, 3], pixel centres [M, 2], screen covariances [M, 3] (xx, xy, yy), area
+# before the low-pass [M], det [M], and which rows have a place on the image [M].
+_OnScreen = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def _onto_screen(
@@ -178,14 +207,8 @@ def _onto_screen(
     K: Float[Tensor, "3 3"],
     size: Float[Tensor, " 2"],
     low_pass: float,
-) -> tuple[
-    Float[Tensor, "M 3"],
-    Float[Tensor, "M 2"],
-    Float[Tensor, "M 3"],
-    Float[Tensor, " M"],
-    Float[Tensor, " M"],
-]:
-    """Camera-space centres, pixel centres, screen covariances (xx, xy, yy), |m0 x m1| and det."""
+) -> _OnScreen:
+    """By EWA, through a pinhole; all rows have a place, those behind the camera too."""
     rotation = world_to_camera[:3, :3]
     cam = means @ rotation.mT + world_to_camera[:3, 3]
     inverse_z = 1.0 / cam[:, 2]
@@ -205,7 +228,37 @@ def _onto_screen(
     area = torch.linalg.vector_norm(torch.linalg.cross(m0, m1), dim=-1)
     # area^2 = xx yy - xy^2, by Lagrange's identity
     det = area.square() + low_pass * (xx + yy) + low_pass * low_pass
-    return cam, means2d, torch.stack((xx + low_pass, xy, yy + low_pass), -1), area, det
+    covs = torch.stack((xx + low_pass, xy, yy + low_pass), -1)
+    return cam, means2d, covs, area, det, torch.ones_like(det, dtype=torch.bool)
+
+
+def _through_optics(
+    means: Float[Tensor, "M 3"],
+    quats: Float[Tensor, "M 4"],
+    log_scales: Float[Tensor, "M 3"],
+    offsets: Float[Tensor, "M 2"] | None,
+    world_to_camera: Float[Tensor, "4 4"],
+    motion: Float[Tensor, " 6"] | None,
+    K: Float[Tensor, "3 3"],
+    size: tuple[int, int],
+    low_pass: float,
+    optics: Optics,
+    near: float,
+) -> _OnScreen:
+    """By the unscented transform; the pose is that in the middle of the exposure."""
+    cam = means @ world_to_camera[:3, :3].mT + world_to_camera[:3, 3]
+    axes = quats_to_matrices(quats) * log_scales.exp()[:, None, :]
+    means2d, root, seen = unscented(means, axes, world_to_camera, motion, K, size, optics, near)
+    if offsets is not None:
+        means2d = means2d + offsets
+    m0, m1 = root.unbind(1)
+    xx, xy, yy = (m0 * m0).sum(-1), (m0 * m1).sum(-1), (m1 * m1).sum(-1)
+    i, j = torch.triu_indices(7, 7, 1, device=means.device)
+    area = torch.linalg.vector_norm(m0[:, i] * m1[:, j] - m0[:, j] * m1[:, i], dim=-1)
+    # area^2 = xx yy - xy^2, by Lagrange's identity
+    det = area.square() + low_pass * (xx + yy) + low_pass * low_pass
+    covs = torch.stack((xx + low_pass, xy, yy + low_pass), -1)
+    return cam, means2d, covs, area, det, seen
 
 
 def _extents(

@@ -121,6 +121,8 @@ def blend_cameras(a: Camera, b: Camera, r: float) -> Camera:
     """The camera a share r of the way from `a` to `b`, in the image size of `a`."""
     if r == 0.0:
         return a
+    for camera in (a, b):
+        camera.need_pinhole("blend_cameras")
     b = in_shape(b, a.width, a.height)
     before, after = (matrices_to_quats(c.world_to_camera[:3, :3]) for c in (a, b))
     rotation = quats_to_matrices(slerp(before, after, r))

@@ -1,8 +1,9 @@
-"""Pinhole camera with OpenCV axes: x right, y down, z forward; pixel centres at +0.5."""
+"""Camera with OpenCV axes: x right, y down, z forward; pixel centres at +0.5."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.errors import CameraError
+from hoigs.core.maths.optics import Optics, world_points_on_image
 from hoigs.core.maths.rotations import exp_se3, quats_to_matrices
 
 ROTATION_TOLERANCE = 1e-3  # of R R^T - I: generous to float16 and to files of few digits
@@ -47,23 +49,27 @@ def pinhole_rays(
 
 @dataclass(frozen=True)
 class Camera:
-    """One pinhole view.
+    """One view: of a pinhole with a global shutter, unless it has `optics`.
 
     Attributes:
         K: intrinsics [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixels; the centre of the top-left
             pixel is at (0.5, 0.5).
         world_to_camera: rigid transform x_cam = R x_world + t, metres ("viewmat").
         width, height: image size, pixels.
+        optics: fisheye, orthographic, distorted, or with a rolling shutter; None for a pinhole.
+            Rasterizers declare what they draw of them (`Capabilities.optics`), and `project`
+            obeys them; all that goes from pixels to the world is for pinholes.
 
     Raises:
-        CameraError: no pinhole, see `check`. The values of tensors on a GPU, which would have to be
-            waited for, and of those that require a gradient are not looked at: call `check`.
+        CameraError: broken values, see `check`. Those of tensors on a GPU, which would have to be
+            waited for, and of tensors that require a gradient are not looked at: call `check`.
     """
 
     K: Float[Tensor, "3 3"]
     world_to_camera: Float[Tensor, "4 4"]
     width: int
     height: int
+    optics: Optics | None = None
 
     def __post_init__(self) -> None:
         self._check(wait=False)
@@ -78,11 +84,14 @@ class Camera:
         self._check(wait=True)
 
     def _check(self, wait: bool) -> None:
-        for name, size, problem in (
-            ("K", 3, _intrinsics_problem),
-            ("world_to_camera", 4, _pose_problem),
-        ):
-            value = getattr(self, name)
+        checked = [
+            ("K", self.K, 3, _intrinsics_problem),
+            ("world_to_camera", self.world_to_camera, 4, _pose_problem),
+        ]
+        if self.optics is not None and self.optics.last_world_to_camera is not None:
+            last = self.optics.last_world_to_camera
+            checked.append(("optics.last_world_to_camera", last, 4, _pose_problem))
+        for name, value, size, problem in checked:
             if not isinstance(value, Tensor) or value.shape != (size, size):
                 shape = list(getattr(value, "shape", ()))
                 raise CameraError(
@@ -96,9 +105,18 @@ class Camera:
 
     @property
     def center(self) -> Float[Tensor, " 3"]:
-        """Camera centre in the world, metres."""
+        """Camera centre in the world, metres; see `middle` for a rolling shutter."""
         rotation, shift = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.mT @ shift
+
+    @property
+    def middle(self) -> Camera:
+        """The camera in the middle of its exposure; itself, with a global shutter."""
+        if self.optics is None or self.optics.last_world_to_camera is None:
+            return self
+        pose, _ = self.optics.middle(self.world_to_camera)
+        still = replace(self.optics, shutter="global", last_world_to_camera=None)
+        return replace(self, world_to_camera=pose, optics=still)
 
     @property
     def focal(self) -> Float[Tensor, " 2"]:
@@ -110,7 +128,23 @@ class Camera:
             self,
             K=self.K.to(*args, **kwargs),
             world_to_camera=self.world_to_camera.to(*args, **kwargs),
+            optics=self._mapped_optics(lambda pose: pose.to(*args, **kwargs)),
         )
+
+    def _mapped_optics(self, change: Callable[[Tensor], Tensor]) -> Optics | None:
+        return None if self.optics is None else self.optics.map_pose(change)
+
+    def need_pinhole(self, what: str) -> None:
+        """For code that knows K and the pose only.
+
+        Raises:
+            CameraError: the camera has optics; says that `what` is for pinholes.
+        """
+        if self.optics is not None:
+            raise CameraError(
+                f"{what} is for pinholes, and this camera has {self.optics}; undistort its images, "
+                "or leave `optics` out"
+            )
 
     def to_camera(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """World points in camera coordinates, metres."""
@@ -123,7 +157,16 @@ class Camera:
     def project(
         self, points: Float[Tensor, "*batch 3"]
     ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
-        """Pixels (x, y) and depth in metres of world points; depth may be negative (behind)."""
+        """Pixels (x, y) and depth in metres of world points; depth may be negative (behind).
+
+        With optics, pixels are NaN where a point has no place, see `hoigs.core.maths.optics`.
+        """
+        if self.optics is not None:
+            pose, motion = self.optics.middle(self.world_to_camera)
+            size = (self.width, self.height)
+            places, seen = world_points_on_image(points, pose, motion, self.K, size, self.optics)
+            depth = points @ pose[2, :3] + pose[2, 3]
+            return torch.where(seen[..., None], places, torch.nan), depth
         cam = self.to_camera(points)
         return pinhole_pixels(self.K, cam), cam[..., 2]
 
@@ -138,6 +181,7 @@ class Camera:
         self, pixels: Float[Tensor, "*batch 2"], depth: Float[Tensor, "*batch"]
     ) -> Float[Tensor, "*batch 3"]:
         """World points at pixels (x, y) and depths along z, metres."""
+        self.need_pinhole("Camera.unproject")
         xy = pinhole_rays(self.K, pixels) * depth[..., None]
         return self.to_world(torch.cat((xy, depth[..., None]), -1))
 
@@ -149,6 +193,7 @@ class Camera:
 
     def rays(self) -> Float[Tensor, "H W 3"]:
         """Unit directions in the world of what all pixels show, from `center`."""
+        self.need_pinhole("Camera.rays")
         xy = pinhole_rays(self.K, self.pixel_grid())
         directions = (
             torch.cat((xy, torch.ones_like(xy[..., :1])), -1) @ self.world_to_camera[:3, :3]
@@ -165,15 +210,27 @@ class Camera:
         """
         quat, moved = exp_se3(turn, shift)
         R: Float[Tensor, "3 3"] = quats_to_matrices(quat)
-        given = self.world_to_camera
-        top = torch.cat((R @ given[:3, :3], (R @ given[:3, 3] + moved)[:, None]), 1)
-        return replace(self, world_to_camera=torch.cat((top, given[3:]), 0))
+
+        def after(given: Tensor) -> Tensor:
+            top = torch.cat((R @ given[:3, :3], (R @ given[:3, 3] + moved)[:, None]), 1)
+            return torch.cat((top, given[3:]), 0)
+
+        pose = after(self.world_to_camera)
+        return replace(self, world_to_camera=pose, optics=self._mapped_optics(after))
 
     def scaled(self, scale: float) -> Camera:
         """The same view of a world made `scale` times larger."""
-        w2c = self.world_to_camera.clone()
-        w2c[:3, 3] *= scale
-        return replace(self, world_to_camera=w2c)
+        K = self.K
+        if self.optics is not None and self.optics.model == "ortho":  # pixels per metre
+            K = K / K.new_tensor([[scale, scale, 1.0], [scale, scale, 1.0], [1.0, 1.0, 1.0]])
+
+        def after(given: Tensor) -> Tensor:
+            pose = given.clone()
+            pose[:3, 3] *= scale
+            return pose
+
+        pose = after(self.world_to_camera)
+        return replace(self, K=K, world_to_camera=pose, optics=self._mapped_optics(after))
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another image size."""
@@ -181,7 +238,13 @@ class Camera:
         return replace(self, K=self.K * scale, width=width, height=height)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The part of the image that starts at pixel (left, top)."""
+        """The part of the image that starts at pixel (left, top).
+
+        Raises:
+            CameraError: it has a rolling shutter, whose rows are those of the whole image.
+        """
+        if self.optics is not None and self.optics.shutter != "global":
+            raise CameraError("Camera.cropped: a rolling shutter's rows are the whole image's")
         shift = self.K.new_tensor([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
         return replace(self, K=self.K - shift, width=width, height=height)
 

@@ -216,6 +216,8 @@ class Clip:
         for what, name in (("clip", self.name), *(("entity", name) for name in self.kinds)):
             if not is_plain(name):  # it could be trained, and its records not be read back
                 raise ClipError(f"the {what}'s name {name!r} holds control characters; rename it")
+        for camera in self.cameras:
+            camera.need_pinhole(f"a clip ({self.name})")
         if self.world is None:
             object.__setattr__(self, "world", World.guessed(self.cameras))
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hoigs.core.errors import ClipError, did_you_mean
+from hoigs.core.maths.optics import Model, Optics
 from hoigs.core.values.camera import Camera
 
 # Undistortion: images, masks and depth of a lens with distortion, as a pinhole sees them.
@@ -92,6 +93,16 @@ class Undistortion:
 
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+# COLMAP's lenses as `Optics`: model, and where k1, k2, … and p1, p2 are among the parameters
+OPTICS: dict[str, tuple[Model, Sequence[int], Sequence[int]]] = {
+    "SIMPLE_RADIAL": ("pinhole", (3,), ()),
+    "RADIAL": ("pinhole", (3, 4), ()),
+    "OPENCV": ("pinhole", (4, 5), (6, 7)),
+    "FULL_OPENCV": ("pinhole", (4, 5, 8, 9, 10, 11), (6, 7)),
+    "SIMPLE_RADIAL_FISHEYE": ("fisheye", (3,), ()),
+    "RADIAL_FISHEYE": ("fisheye", (3, 4), ()),
+    "OPENCV_FISHEYE": ("fisheye", (4, 5, 6, 7), ()),
+}
 NEGLIGIBLE_SHIFT = 0.01  # pixels of distortion below which a lens counts as a pinhole
 
 
@@ -161,10 +172,34 @@ class Lens:
             dtype=torch.float64,
         )
 
-    def camera(self, world_to_camera: Float[np.ndarray, "4 4"]) -> Camera:
-        """The pinhole camera that undistorted images belong to, float32."""
+    def camera(self, world_to_camera: Float[np.ndarray, "4 4"], distorted: bool = False) -> Camera:
+        """The pinhole camera that undistorted images belong to, float32.
+
+        Args:
+            distorted: that of the images as they are, with `optics`.
+        """
         w2c = torch.from_numpy(np.asarray(world_to_camera, np.float64))
-        return Camera(self.K.float(), w2c.float(), self.width, self.height)
+        optics = self.optics if distorted else None
+        return Camera(self.K.float(), w2c.float(), self.width, self.height, optics)
+
+    @property
+    def optics(self) -> Optics | None:
+        """What a camera with this lens has besides K; None for a pinhole.
+
+        Raises:
+            ClipError: a model that is not among OPTICS.
+        """
+        if self.model in PINHOLES:
+            return None
+        if self.model not in OPTICS:
+            raise ClipError(
+                f"a {self.model} lens cannot be drawn as it is, expected one of "
+                f"{', '.join((*PINHOLES, *OPTICS))}; draw its pinhole (Lens.camera), for "
+                "undistorted images"
+            )
+        model, radial, tangential = OPTICS[self.model]
+        k, p = (tuple(self.params[i] for i in indices) for indices in (radial, tangential))
+        return Optics(model, k, p)
 
     def resized(self, width: int, height: int) -> Lens:
         """The same lens behind an image of another size."""

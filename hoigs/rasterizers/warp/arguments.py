@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoigs.rasterizers.warp.frame import Images, Inputs, Settings, TileIntersections
+from hoigs.rasterizers.warp.frame import MOTION, Images, Inputs, Settings, TileIntersections
 from hoigs.rasterizers.warp.records import ABSOLUTES, POSE, RECORD, SMALLEST_ALPHA
 
 # What the projection kernels are given and write, on every device.
@@ -49,7 +49,7 @@ def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> lis
 class Gradients:
     """What `kernels.project_adjoint` writes, in the shapes of the inputs."""
 
-    def __init__(self, inputs: Inputs, pose: bool, absolute: bool) -> None:
+    def __init__(self, inputs: Inputs, pose: bool, absolute: bool, optics: bool = False) -> None:
         self.with_pose, self.absolute = pose, absolute
         self.means = torch.empty_like(inputs.means)
         self.quats = torch.empty_like(inputs.quats)
@@ -60,6 +60,12 @@ class Gradients:
         self.screen_offsets = inputs.means.new_empty(inputs.count, 2)
         self.absolutes = inputs.means.new_empty(inputs.count if absolute else 0, ABSOLUTES)
         self.pose = inputs.means.new_empty(inputs.count if pose else 0, POSE)
+        self.all_poses, self.motion = self.pose, None
+        if optics and pose:  # rows of the motion follow those of the poses
+            split = inputs.count * POSE
+            self.all_poses = inputs.means.new_zeros(split + inputs.count * MOTION)
+            self.pose = self.all_poses[:split].view(-1, POSE)
+            self.motion = self.all_poses[split:].view(-1, MOTION)
 
     def world_to_camera(self, inputs: Inputs) -> Tensor:
         """Gradient of world_to_camera [4, 4] from the rows of `pose`.
@@ -73,6 +79,14 @@ class Gradients:
         center = total[12:]
         result[:3, :3] = total[:9].view(3, 3) - torch.outer(translation, center)
         result[:3, 3] = total[9:12] - rotation @ center
+        return result
+
+    def camera_numbers(self, inputs: Inputs) -> Tensor | None:
+        """Gradient of what stands for K with optics: of the motion, which is last."""
+        if self.motion is None:
+            return None
+        result = torch.zeros_like(inputs.K)
+        result[-MOTION:] = self.motion.sum(0)
         return result
 
 
@@ -94,7 +108,7 @@ def adjoint_arguments(
         *(records, intersections.first_partial, intersections.tiles_per_gaussian, partials),
         *(out.means, out.quats, out.log_scales, out.opacity_logits, out.sh),
         *(out.screen_offsets, out.features, out.absolutes, ABSOLUTES * int(len(out.absolutes) > 0)),
-        *(out.pose, int(out.pose.numel() > 0)),
+        *(out.all_poses, len(out.pose)),
     ]
 
 

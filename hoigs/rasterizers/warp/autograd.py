@@ -59,7 +59,9 @@ class Render(torch.autograd.Function):
         )
         needs = Inputs(*ctx.needs_input_grad[2:])
         with torch.cuda.device_of(inputs.means):
-            out = Gradients(inputs, bool(needs.world_to_camera), bool(needs.absolute_gradients))
+            moving = bool(needs.K) and ctx.settings.optics
+            pose = bool(needs.world_to_camera) or moving
+            out = Gradients(inputs, pose, bool(needs.absolute_gradients), ctx.settings.optics)
             ctx.pipeline.gradients(inputs, ctx.settings, records, intersections, images, v, out)
         background = None
         if needs.background:
@@ -76,7 +78,7 @@ class Render(torch.autograd.Function):
             screen_offsets=out.screen_offsets if needs.screen_offsets else None,
             background=background,
             world_to_camera=out.world_to_camera(inputs) if needs.world_to_camera else None,
-            K=None,
+            K=out.camera_numbers(inputs) if moving else None,
             subset=None,
             absolute_gradients=out.absolutes if needs.absolute_gradients else None,
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -12,10 +12,12 @@ from torch import Tensor
 
 from hoigs.core.errors import RenderError
 from hoigs.core.interfaces.rasterizer import RenderRequest
+from hoigs.core.maths.optics import MODELS, Model, Optics
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 
 INT32 = 2**31 - 1
+MOTION = 6  # turn and shift of a rolling shutter
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,7 @@ class Settings:
 
     Attributes:
         active_bases: how many SH basis functions are used: 1, 4, 9 or 16.
+        optics: whether the camera has some: other kernels project.
     """
 
     width: int
@@ -35,6 +38,7 @@ class Settings:
     max_alpha: float
     min_alpha: float
     min_transmittance: float
+    optics: bool
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,8 @@ class Inputs:
         features [N, F]; screen_offsets [N, 2] pixels; subset [N] uint8.
         absolute_gradients [N, 2]: receives them; its values are not read.
         background: [3] or [H, W, 3].
-        world_to_camera [4, 4], K [3, 3]: of the camera.
+        world_to_camera [4, 4], K [3, 3]: of the camera; with optics the pose in the middle of the
+            exposure, and for K `camera_numbers`.
     """
 
     means: Tensor
@@ -157,11 +162,16 @@ class InputValidation:
         Raises:
             RenderError: input that cannot be drawn.
         """
+        optics = getattr(camera, "optics", None)
+        plain = camera if optics is None else replace(camera, optics=None)
         key = tuple(
             (x.shape, x.dtype, x.device) if isinstance(x, Tensor) else x
-            for value in (gaussians, camera, request)
+            for value in (gaussians, plain, request)
             for x in getattr(value, "__dict__", {}).values()  # the check names other types
         )
+        if optics is not None:
+            pose = optics.last_world_to_camera
+            key += (optics.needs, None if pose is None else (pose.shape, pose.device))
         settings = self._passed.get(key)
         if settings is None:
             self._check(gaussians, camera, request)
@@ -184,7 +194,7 @@ def _settings(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> S
         active_bases=stored if degree is None else min(stored, (degree + 1) ** 2),
         near=request.near, low_pass=request.low_pass, antialiased=request.antialiased,
         max_alpha=request.max_alpha, min_alpha=request.min_alpha,
-        min_transmittance=request.min_transmittance,
+        min_transmittance=request.min_transmittance, optics=camera.optics is not None,
     )  # fmt: skip
 
 
@@ -192,6 +202,9 @@ def _tensors(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> li
     like = gaussians.means
     background, subset = request.background, request.subset
     features, offsets = request.features, request.screen_offsets
+    pose, numbers = camera.world_to_camera, camera.K
+    if camera.optics is not None:
+        pose, numbers = camera_numbers(camera, camera.optics)
     tensors = [
         like,
         gaussians.quats,
@@ -201,8 +214,8 @@ def _tensors(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> li
         like.new_empty(like.shape[0], 0) if features is None else features,
         _constant(like.device, 0, 2) if offsets is None else offsets,
         _black(like) if background is None else background,
-        camera.world_to_camera,
-        camera.K,
+        pose,
+        numbers,
     ]
     tensors = [
         x if x.dtype == torch.float32 and x.is_contiguous() else x.float().contiguous()
@@ -213,6 +226,34 @@ def _tensors(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> li
         drawn = subset.contiguous().view(torch.uint8)
     absolutes = request.absolute_gradients
     return [*tensors, drawn, _constant(like.device, 0, 2) if absolutes is None else absolutes]
+
+
+def camera_numbers(camera: Camera, optics: Optics) -> tuple[Tensor, Tensor]:
+    """The pose in the middle of the exposure, and K with all that `project.optics` reads beside it.
+
+    Of the numbers only the motion has a gradient, as K has none.
+    """
+    pose, motion = optics.middle(camera.world_to_camera.double())
+    fixed = _optics_numbers(
+        optics.model, optics.coefficients, optics.largest_slope, motion is not None,
+        optics.row_time(camera.width, camera.height), camera.K.device,
+    )  # fmt: skip
+    parts = [camera.K.detach().flatten(), fixed]
+    return pose, torch.cat([*parts, fixed[:MOTION] if motion is None else motion])
+
+
+@functools.lru_cache(maxsize=CACHE_SIZE)
+def _optics_numbers(
+    model: Model,
+    coefficients: tuple[float, ...],
+    largest_slope: float,
+    moves: bool,
+    row_time: tuple[float, float, float],
+    device: torch.device,
+) -> Tensor:
+    numbers = [MODELS.index(model), *coefficients, largest_slope, moves, *row_time]
+    with torch.inference_mode(False):
+        return torch.tensor(numbers, dtype=torch.float64, device=device)
 
 
 def _black(like: Tensor) -> Tensor:

@@ -9,7 +9,13 @@ from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import RenderError
-from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.interfaces.rasterizer import (
+    OPTICS,
+    Capabilities,
+    Rasterizer,
+    RenderOutput,
+    RenderRequest,
+)
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp.autograd import Render
@@ -63,6 +69,7 @@ class WarpRasterizer(Rasterizer):
         camera_gradients=True,
         deterministic=True,
         absolute_gradients=True,
+        optics=OPTICS,
     )
 
     def __init__(self, config: WarpConfig | None = None) -> None:

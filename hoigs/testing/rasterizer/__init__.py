@@ -9,9 +9,15 @@ The rules are those of `hoigs.core.maths.projection`; the reference is `rasteriz
 from __future__ import annotations
 
 from hoigs.testing.checks import run_checks
-from hoigs.testing.rasterizer import contract, drawing, gradients  # importing them fills CHECKS
+from hoigs.testing.rasterizer import (  # importing them fills CHECKS
+    contract,
+    drawing,
+    gradients,
+    optics,
+)
 from hoigs.testing.rasterizer.subject import CHECKS, RasterizerSubject, subject
 
 __all__ = [
-    "CHECKS", "RasterizerSubject", "contract", "drawing", "gradients", "run_checks", "subject",
+    "CHECKS", "RasterizerSubject", "contract", "drawing", "gradients", "optics", "run_checks",
+    "subject",
 ]  # fmt: skip

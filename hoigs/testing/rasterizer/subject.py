@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.rasterizer import Capabilities, Rasterizer, RenderOutput, RenderRequest
+from hoigs.core.maths.optics import Optics
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import FIELDS as RAW
 from hoigs.core.values.gaussians import Gaussians
@@ -128,11 +129,13 @@ def images(output: RenderOutput) -> dict[str, Tensor]:
 
 def on(device: torch.device, value: Value) -> Value:
     """Gaussians, a Camera or a RenderRequest, moved."""
-    moved = {
+    moved: dict[str, Any] = {
         f.name: v.to(device)
         for f in fields(value)  # type: ignore[arg-type]
         if isinstance(v := getattr(value, f.name), Tensor)
     }
+    if isinstance(optics := getattr(value, "optics", None), Optics):
+        moved["optics"] = optics.map_pose(lambda pose: pose.to(device))
     return forged(value, **moved)
 
 
@@ -145,7 +148,7 @@ def forged(value: Value, **changes: Any) -> Value:
 
 
 FIELDS = ("features", "screen_offsets", "background", "absolute_gradients")
-INPUTS = (*RAW, *FIELDS, "world_to_camera")
+INPUTS = (*RAW, *FIELDS, "world_to_camera", "last_world_to_camera")
 
 
 @dataclass(frozen=True)
@@ -181,10 +184,15 @@ class RasterizerSubject:
             parts[name] = getattr(scene.request, name)
         if self.rasterizer.capabilities.camera_gradients:
             parts["world_to_camera"] = scene.camera.world_to_camera
+            if scene.camera.optics is not None:
+                parts["last_world_to_camera"] = scene.camera.optics.last_world_to_camera
         leaves = {
             name: x.detach().clone().requires_grad_() for name, x in parts.items() if x is not None
         }
-        view = {k: leaves[k] for k in ("world_to_camera",) if k in leaves}
+        view: dict[str, Any] = {k: leaves[k] for k in ("world_to_camera",) if k in leaves}
+        if "last_world_to_camera" in leaves and scene.camera.optics is not None:
+            last = leaves["last_world_to_camera"]
+            view["optics"] = replace(scene.camera.optics, last_world_to_camera=last)
         fields = {name: leaves[name] for name in FIELDS if name in leaves}
         output = self.render(
             Gaussians(*(leaves[name] for name in RAW)),

@@ -31,7 +31,8 @@ from hoigs.rasterizers.warp.frame import (
 )
 from hoigs.rasterizers.warp.intersect import portable_kernels
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
-from hoigs.rasterizers.warp.project.kernels import project, project_adjoint
+from hoigs.rasterizers.warp.project import kernels as pinhole
+from hoigs.rasterizers.warp.project import optics
 from hoigs.rasterizers.warp.records import ABSOLUTES, MOMENTS
 
 
@@ -51,7 +52,8 @@ class CpuPipeline(ABC):
 
     def project(self, inputs: Inputs, settings: Settings) -> Projected:
         out = Projected(inputs.means, inputs.count)
-        self.cores.each(project, inputs.count, project_arguments(inputs, settings, out))
+        kernel = (optics if settings.optics else pinhole).project
+        self.cores.each(kernel, inputs.count, project_arguments(inputs, settings, out))
         return out
 
     @abstractmethod
@@ -89,7 +91,8 @@ class CpuPipeline(ABC):
         kernel = self.absolute_kernel if out.absolute else self.backward_kernel
         self._tiles(kernel, intersections, arguments)
         arguments = adjoint_arguments(inputs, settings, records, intersections, partials, out)
-        self.cores.each(project_adjoint, inputs.count, arguments)
+        kernel = (optics if settings.optics else pinhole).project_adjoint
+        self.cores.each(kernel, inputs.count, arguments)
 
     @abstractmethod
     def _tiles(self, kernel: Any, intersections: TileIntersections, arguments: list[Any]) -> None:

@@ -30,7 +30,8 @@ from hoigs.rasterizers.warp.frame import (
     TileIntersections,
     check_addressable,
 )
-from hoigs.rasterizers.warp.project.kernels import project, project_adjoint
+from hoigs.rasterizers.warp.project import kernels as pinhole
+from hoigs.rasterizers.warp.project import optics
 from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import BLOCK as SH_BLOCK
 from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import harmonics_adjoint
 from hoigs.rasterizers.warp.records import ABSOLUTES, MOMENTS
@@ -49,7 +50,8 @@ class CudaPipeline:
     def project(self, inputs: Inputs, settings: Settings) -> Projected:
         out = Projected(inputs.means, inputs.count)
         arguments = project_arguments(inputs, settings, out)
-        self.streams.current().each(project, inputs.count, arguments)
+        kernel = (optics if settings.optics else pinhole).project
+        self.streams.current().each(kernel, inputs.count, arguments)
         return out
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
@@ -97,6 +99,7 @@ class CudaPipeline:
         blocks = -(-count // gather_kernels.ROWS)
         stream.blocks(gather_kernels.gather_partials, blocks, gather_kernels.BLOCK, arguments)
         gathered = replace(intersections, tiles_per_gaussian=drawn)  # one partial each from here on
+        project_adjoint = (optics if settings.optics else pinhole).project_adjoint
         if settings.active_bases == 1:
             arguments = adjoint_arguments(inputs, settings, records, gathered, partials, out)
             stream.each(project_adjoint, count, arguments)

@@ -224,3 +224,24 @@ def onto_screen_adjoint(
     )  # fmt: skip
     raw.quat = quat_adjoint(quat, v_turn)
     return raw
+
+
+@wp.func
+def shape_adjoint(
+    s: Screen, quat: wp.vec4, scale: wp.vec3, mean: wp.vec3, K: F32, world_to_camera: F32,
+    low_pass: float, v_u: float, v_v: float, v_depth: float, v_det: float, v_square: float,
+    v_xy: float, v_yy: float, v_pose: F32, has_pose: int, row: int,
+) -> Raw:  # fmt: skip
+    """Gradients of the raw geometry, given those of the centre, the depth and the covariance.
+
+    Args:
+        v_det: by det. v_square: by its part |m0 x m1|^2, all together.
+        v_xy, v_yy: by the covariance, other than through det.
+        v_pose, has_pose, row: where more gradients of the pose go; a pinhole has none.
+    """
+    v_normal = 2.0 * v_square * s.normal
+    v_m0 = wp.cross(s.m1, v_normal) + 2.0 * low_pass * v_det * s.m0 + v_xy * s.m1
+    v_m1 = wp.cross(v_normal, s.m0) + 2.0 * (low_pass * v_det + v_yy) * s.m1 + v_xy * s.m0
+    return onto_screen_adjoint(
+        s, quat, scale, mean, K, world_to_camera, v_u, v_v, v_depth, v_m0, v_m1
+    )
