@@ -31,7 +31,6 @@ BARE = (
     (24, 26), (26, 28), (7, 8),
 )  # fmt: skip
 THIN = 0.07  # radius of these, in torsos
-OF_SHOULDERS = 1.4  # torso length of an adult who faces the camera, in breadths of the shoulders
 SAMPLED = 12  # frames in which the body's colours are learnt
 
 
@@ -72,12 +71,6 @@ def torso_length(landmarks: Float[np.ndarray, "F 33 4"]) -> Float[np.ndarray, "F
         return length
     usual = np.nanquantile(length, 0.75)
     return np.fmax(length, 0.8 * usual)
-
-
-def shoulder_breadth(landmarks: Float[np.ndarray, "F 33 4"]) -> Float[np.ndarray, "F"]:
-    """Pixels between the shoulders; NaN where one is not seen."""
-    breadth = np.linalg.norm(np.subtract(*np.moveaxis(landmarks[:, SHOULDERS, :2], 1, 0)), axis=-1)
-    return np.where((landmarks[:, SHOULDERS, 3] >= SEEN).all(1), breadth, np.nan)
 
 
 def limbs(
@@ -183,19 +176,16 @@ class Footage:
 def body_colors(
     footage: Footage, people: Sequence[Float[np.ndarray, "F 33 4"]]
 ) -> Float[np.ndarray, "B"] | None:
-    """Colours along the limbs over the video, which a thing that is held covers now and then; None
-    where no shoulders are seen."""
-    lengths = [torso_length(p) for p in people]
-    if not any(np.isfinite(length).any() for length in lengths):
-        lengths = [OF_SHOULDERS * shoulder_breadth(p) for p in people]
-    lengths = np.concatenate([*lengths, [np.nan]])
+    """Colours along the limbs in most of some frames, as a thing that is held covers them now and
+    then; None where no torso is seen."""
+    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
     if not np.isfinite(lengths).any():
         return None
     torso, found = float(np.nanmedian(lengths)), []
     for i in np.unique(np.linspace(0, len(footage) - 1, SAMPLED).astype(int)).tolist():
         bare = bare_limbs(footage.shape, [p[i] for p in people], torso) & footage.person[i]
         found += [histogram(bins_of(footage.colors(i)), bare * 1.0)] if bare.any() else []
-    return np.mean(found, 0) if found else None
+    return np.median(found, 0) if found else None
 
 
 def to_features(lab: np.ndarray) -> Float[np.ndarray, "... 3"]:
