@@ -83,6 +83,10 @@ def around(
     return Filmed(objects, humans, humans, cameras, lambda: iter(images), FPS, joints, PARENTS)
 
 
+def not_flat(*_: object) -> object:
+    raise UntrackableError("it is a box")
+
+
 def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.rad2deg(torch.acos((((a * b).sum((-1, -2)) - 1) / 2).clamp(-1, 1)))
 
@@ -295,6 +299,7 @@ def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -
         return track, points, replace(ObjectConfidence.none("t", FRAMES, ""),
                                       outline=np.full(FRAMES, 0.1))  # fmt: skip
 
+    monkeypatch.setattr(making, "plate_object", not_flat)
     monkeypatch.setattr(making, "tracked_object", collapsed)
     made = make_object(
         None, around(images, objects, humans, joints), way="auto", radius=None, count=200,
@@ -324,6 +329,7 @@ def test_poses_that_leave_the_masks_lose_to_the_outlines(
         )
         return replace(good.track, translations=places), normals, confidence
 
+    monkeypatch.setattr(making, "plate_object", not_flat)
     monkeypatch.setattr(making, "tracked_object", moved)
     made = make_object(None, shown, way=way, **settings)  # type: ignore[arg-type]
     assert made.confidence.way == taken
