@@ -482,7 +482,7 @@ class _Problem:
             + outline
             + HANDS * self.held.offsets(poses)
             + self.held.moved(poses)
-            + SMOOTH * self._jerks(poses)
+            + SMOOTH * jerks(self.times, poses)
             + BEND * bends.square().sum(-1).mean() * len(vertices) / 100
             + SHRINK * area / 100
         )
@@ -515,25 +515,26 @@ class _Problem:
             agreement[weight[..., 0].sum(-1) < 20] = torch.nan
         return photo, outside * pixel / OUTLINE, reach, agreement
 
-    def _jerks(self, poses: Poses) -> Tensor:
-        """Mean square accelerations, in units, over gaps of any length."""
-        gaps = self.times.diff()
-        if len(gaps) < 2:
-            return poses.translations.new_zeros(())
-        middle = (gaps[1:] + gaps[:-1])[:, None] / 2
-        speed = poses.translations.diff(dim=0) / gaps[:, None]
-        turn = poses.rotations[1:] @ poses.rotations[:-1].mT
-        spin = _small_log(turn) / gaps[:, None]
-        linear = speed.diff(dim=0) / middle / ACCELERATION
-        angular = spin.diff(dim=0) / middle / SPIN
-        return _robust(linear.square().sum(-1)).mean() + _robust(angular.square().sum(-1)).mean()
-
     def judged(
         self, poses: Poses, vertices: Tensor
     ) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, " C"], float]:
         _, outside, reach, agreement = self._parts(poses, vertices)
         outline = OUTLINE * (outside.mean(-1) + reach.mean(-1))
         return agreement.numpy(), outline.numpy(), float(self.energy(poses, vertices))
+
+
+def jerks(times: Float[Tensor, " C"], poses: Poses) -> Tensor:
+    """Mean square accelerations, in units, over gaps of any length; times in seconds."""
+    gaps = times.diff()
+    if len(gaps) < 2:
+        return poses.translations.new_zeros(())
+    middle = (gaps[1:] + gaps[:-1])[:, None] / 2
+    speed = poses.translations.diff(dim=0) / gaps[:, None]
+    turn = poses.rotations[1:] @ poses.rotations[:-1].mT
+    spin = _small_log(turn) / gaps[:, None]
+    linear = speed.diff(dim=0) / middle / ACCELERATION
+    angular = spin.diff(dim=0) / middle / SPIN
+    return _robust(linear.square().sum(-1)).mean() + _robust(angular.square().sum(-1)).mean()
 
 
 def _robust(squares: Tensor) -> Tensor:

@@ -27,8 +27,10 @@ from hoigs.preparation.objects.ball import (
 )
 from hoigs.preparation.objects.explained import colors_of, held_back_error, silhouette_ious
 from hoigs.preparation.objects.filmed import Filmed
+from hoigs.preparation.objects.plate import plate_object
 from hoigs.preparation.objects.shape import held_object, sphere_points
-from hoigs.preparation.objects.tracked import ObjectConfidence, UntrackableError, tracked_object
+from hoigs.preparation.objects.tracked import ObjectConfidence, tracked_object
+from hoigs.preparation.objects.watched import UntrackableError, watched
 from hoigs.preparation.options import ObjectWay
 
 # What makes an object's track doubtful: seen in its masks and the landmarks, and said.
@@ -212,8 +214,8 @@ def make_object(
     be, and the confidence names why.
 
     Args:
-        way: how; "auto": as a ball where all masks are round, or else by texture, or by outlines
-            where these explain frames that are held back better.
+        way: how; "auto": as a ball where all masks are round, or else as something flat, as any
+            body by its texture, or by outlines: what explains frames that are held back better.
         radius: of a ball, metres; None: a football's for a tracked ball, and for a round mask that
             which the limbs at it give.
         count: of points.
@@ -238,36 +240,67 @@ def make_object(
         except NoBallError as reason:
             if way == "ball":
                 reasons.append(f"it cannot be posed as a ball: {reason}")
-    by_texture = None
-    try:
-        if way == "outline":
-            raise UntrackableError("object_track is outline")
-        by_texture = tracked_object(filmed, count, progress)
-        if way == "texture":
-            return _textured(filmed, *by_texture)
-    except UntrackableError as reason:
-        reasons.append(str(reason))
+    turning, failed = _turning(filmed, way, count, progress)
+    reasons += failed
+    if turning and way != "auto":
+        return _made(filmed, turning[0])
     track, normals, spread = held_object(filmed, count)
-    if by_texture is not None:
-        errors = [held_back_error(t, n, filmed) for t, n in (by_texture[:2], (track, normals))]
-        if errors[1] > BETTER * errors[0]:
-            return _textured(filmed, *by_texture)
+    if turning:
+        errors = [held_back_error(one.track, one.normals, filmed) for one in turning]
+        best = int(np.argmin(errors))
+        if errors[0] <= errors[best] / BETTER:
+            best = 0  # the flat thing, which is said in fewer numbers
+        error = held_back_error(track, normals, filmed)
+        if error > BETTER * errors[best]:
+            return _made(filmed, turning[best])
         reasons.append(
-            "in frames held back, what its texture gives is {:.3f} off in colour (of 1), what its "
-            "outlines give {:.3f}: it may be shiny, or not rigid".format(*errors)
+            f"in frames held back, what its texture gives is {errors[best]:.3f} off in colour (of "
+            f"1), what its outlines give {error:.3f}: it may be shiny, or not rigid"
         )
     confidence = ObjectConfidence.none("outline", len(cameras), "; ".join(reasons))
     return colored(track, normals, spread, confidence)
 
 
-def _textured(
-    filmed: Filmed,
-    track: ObjectTrack,
-    normals: Float[Tensor, "P 3"],
-    confidence: ObjectConfidence,
-) -> MadeObject:
-    spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
-    return _colored(filmed, track, normals, spread, confidence)
+@dataclass(frozen=True)
+class _Turning:
+    """A track whose rotation is known, grey, with its points' outward normals."""
+
+    track: ObjectTrack
+    normals: Float[Tensor, "P 3"]
+    spread: float
+    confidence: ObjectConfidence
+
+
+def _turning(
+    filmed: Filmed, way: ObjectWay, count: int, progress: Callable[[float], None]
+) -> tuple[list[_Turning], list[str]]:
+    """Tracks by texture, of a flat thing and of any other, and why there are no more of them."""
+    if way == "outline":
+        return [], ["object_track is outline"]
+    found, reasons = [], []
+    try:
+        seen = watched(filmed)
+    except UntrackableError as reason:
+        return [], [str(reason)]
+    if way in ("auto", "plate"):
+        try:
+            found.append(_Turning(*plate_object(seen, count, lambda done: progress(done / 3))))
+        except UntrackableError as reason:
+            reasons.append(f"it cannot be posed as something flat: {reason}")
+    if way in ("auto", "texture"):
+        try:
+            track, normals, confidence = tracked_object(
+                seen, count, lambda done: progress((1 + 2 * done) / 3)
+            )
+            spread = float(np.nanmean(confidence.outline) / track.points.norm(dim=-1).mean())
+            found.append(_Turning(track, normals, spread, confidence))
+        except UntrackableError as reason:
+            reasons.append(str(reason))
+    return found, reasons
+
+
+def _made(filmed: Filmed, one: _Turning) -> MadeObject:
+    return _colored(filmed, one.track, one.normals, one.spread, one.confidence)
 
 
 def _colored(

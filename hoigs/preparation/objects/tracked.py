@@ -13,7 +13,7 @@ from torch import Tensor
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import ObjectTrack
-from hoigs.preparation.mask_stack import Outlines, outlines_of
+from hoigs.preparation.mask_stack import Outlines
 from hoigs.preparation.objects.alignment import (
     LEVELS,
     Aligned,
@@ -24,24 +24,14 @@ from hoigs.preparation.objects.alignment import (
     Poses,
     Surface,
     align,
-    make_crops,
 )
-from hoigs.preparation.objects.filmed import Filmed
-from hoigs.preparation.objects.hands import HandMotion, along_bones, hand_motion, no_hands
+from hoigs.preparation.objects.hands import HandMotion
 from hoigs.preparation.objects.search import flights_by_texture, grasps_by_texture
 from hoigs.preparation.objects.shape import completed, hull, with_samples
+from hoigs.preparation.objects.watched import FEWEST, UntrackableError, Watched
 
-FEWEST = 8  # frames that show the object whole
-SMALLEST = 10  # pixels across, median
 AGREES = 0.5  # correlation of textures from which a pose is trusted
-FAINTEST, BLUR = 0.02, 2.5  # relative contrast of texture; pixels of a crop it is blurred by
-BEHIND = 0.5  # of its radius behind the hands: from there on the person hides nothing of it
-SIDE = 96  # of the crops, pixels
 SAMPLES = 1200
-
-
-class UntrackableError(Exception):
-    """Why an object's rotation cannot be found from its texture."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +64,7 @@ class ObjectConfidence:
 
 
 def tracked_object(
-    filmed: Filmed,
+    seen: Watched,
     count: int,
     progress: Callable[[float], None],
     levels: Sequence[Level] = LEVELS,
@@ -86,34 +76,10 @@ def tracked_object(
         it may be trusted.
 
     Raises:
-        UntrackableError: too few frames, too small, always cut by the border, or textures that
-            do not agree.
+        UntrackableError: textures do not agree.
     """
-    cameras = filmed.cameras
-    outlines = outlines_of(filmed.masks)
-    _check(outlines)
-    bones = torch.zeros(len(cameras), 0, 3)
-    if filmed.joints is not None:
-        hands = hand_motion(filmed.joints, filmed.masks, outlines, cameras, filmed.fps)
-        bones = along_bones(filmed.joints, filmed.parents)
-    else:
-        assert filmed.depths is not None
-        hands = no_hands(outlines, filmed.depths, cameras, filmed.fps)
-    shown = outlines.observed
-    # metres within which the object lies, from the largest extent of its outlines
-    rows = np.flatnonzero(outlines.whole)
-    metres = [
-        outlines.lengths[i] * hands.depths[i] / float(cameras[i].K[0, 0]) for i in rows.tolist()
-    ]
-    radius = 0.9 * float(np.quantile(metres, 0.95))
-    behind = hands.depths + BEHIND * radius
-    crops = make_crops(filmed, shown, SIDE, bones, behind)
-    contrast = crops.contrast(BLUR)
-    if contrast < FAINTEST:
-        raise UntrackableError(
-            f"it has hardly any texture: its brightness varies by {100 * contrast:.1f} % "
-            f"({100 * FAINTEST:.0f} % are needed)"
-        )
+    outlines, hands, crops, radius = seen.outlines, seen.hands, seen.crops, seen.radius
+    cameras, fps, shown = seen.filmed.cameras, seen.filmed.fps, outlines.observed
     start = _start(hands, outlines, cameras, shown)
     grasps = np.where(hands.near & hands.held[:, None], hands.pieces[:, None], -1)
     starts = np.diff(hands.rests.astype(int), prepend=0) == 1
@@ -123,9 +89,9 @@ def tracked_object(
         torch.from_numpy(grasps[shown]),
         torch.from_numpy(rests[shown]),
     )
-    known = _Known(crops, start, held, hands, radius, filmed.fps)
+    known = _Known(crops, start, held, hands, radius, fps)
     surface, found = _aligned(known, levels, progress)
-    agreement = _over_frames(found.agreement, shown)
+    agreement = over_frames(found.agreement, shown)
     typical = float(np.nanmedian(found.agreement)) if np.isfinite(found.agreement).any() else 0.0
     if typical < AGREES:
         raise UntrackableError(
@@ -191,18 +157,6 @@ def _aligned(
     return surface, found
 
 
-def _check(outlines: Outlines) -> None:
-    whole = int(outlines.whole.sum())
-    if whole < FEWEST:
-        raise UntrackableError(
-            f"{whole} frames show it whole, and {FEWEST} are needed: it is seen too briefly, or "
-            "the border of the image cuts it"
-        )
-    across = float(np.median(np.sqrt(outlines.areas[outlines.whole])))
-    if across < SMALLEST:
-        raise UntrackableError(f"it is {across:.0f} pixels across, and {SMALLEST} are needed")
-
-
 def _start(
     hands: HandMotion,
     outlines: Outlines,
@@ -217,7 +171,7 @@ def _start(
     return Poses(torch.from_numpy(hands.rotations[shown]).float(), torch.stack(places)[shown])
 
 
-def _over_frames(
+def over_frames(
     values: Float[np.ndarray, " C"], shown: Bool[np.ndarray, " F"]
 ) -> Float[np.ndarray, " F"]:
     found = np.full(len(shown), np.nan)
@@ -249,10 +203,7 @@ def _result(
     middle = (points.max(0).values + points.min(0).values) / 2
     rotations, translations = between(found.poses, middle, shown, hands)
     points = points - middle
-    distance = np.full(len(shown), np.nan)
-    for i in np.flatnonzero(hands.held).tolist():
-        palms = torch.from_numpy(hands.palms[i][hands.near[i]]).float()
-        distance[i] = min(_signed_distances(palms, points, normals, rotations[i], translations[i]))
+    distance = palm_distances(hands, points, normals, rotations, translations)
     known = np.isfinite(agreement) & (agreement >= AGREES)
     off = found.outline.mean()
     return (
@@ -274,7 +225,7 @@ def _result(
         ObjectConfidence(
             "texture and hands",
             agreement,
-            _over_frames(found.outline, shown),
+            over_frames(found.outline, shown),
             float(hands.held.mean()),
             float(hands.rests.mean()),
             distance,
@@ -308,16 +259,22 @@ def between(
     return rotations, places
 
 
-def _signed_distances(
-    palms: Float[Tensor, "N 3"],
+def palm_distances(
+    hands: HandMotion,
     points: Float[Tensor, "P 3"],
     normals: Float[Tensor, "P 3"],
-    rotation: Float[Tensor, "3 3"],
-    translation: Float[Tensor, " 3"],
-) -> list[float]:
-    """Metres from palms to the surface, negative inside."""
-    local = (palms - translation) @ rotation
-    away = torch.cdist(local, points)
-    nearest = away.argmin(-1)
-    outwards = ((local - points[nearest]) * normals[nearest]).sum(-1)
-    return (away.gather(1, nearest[:, None])[:, 0] * outwards.sign()).tolist()
+    rotations: Float[Tensor, "F 3 3"],
+    translations: Float[Tensor, "F 3"],
+) -> Float[np.ndarray, " F"]:
+    """Of each frame, metres from the nearest palm that holds it to the surface, negative inside;
+    NaN while not held."""
+    found = np.full(len(rotations), np.nan)
+    for i in np.flatnonzero(hands.held).tolist():
+        palms = torch.from_numpy(hands.palms[i][hands.near[i]]).float()
+        local = (palms - translations[i]) @ rotations[i]
+        away = torch.cdist(local, points)
+        nearest = away.argmin(-1)
+        outwards = ((local - points[nearest]) * normals[nearest]).sum(-1)
+        signed = away.gather(1, nearest[:, None])[:, 0] * outwards.sign()
+        found[i] = float(signed.min())
+    return found

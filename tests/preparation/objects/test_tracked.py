@@ -22,10 +22,10 @@ from hoigs.preparation.objects.search import ballistic, flights_by_texture
 from hoigs.preparation.objects.shape import completed, held_object, hull, with_samples
 from hoigs.preparation.objects.tracked import (
     ObjectConfidence,
-    UntrackableError,
     between,
     tracked_object,
 )
+from hoigs.preparation.objects.watched import UntrackableError, watched
 
 FRAMES, SIZE, FPS = 12, 96, 12.0
 PARENTS = (-1, *range(51))
@@ -83,6 +83,10 @@ def around(
     return Filmed(objects, humans, humans, cameras, lambda: iter(images), FPS, joints, PARENTS)
 
 
+def not_flat(*_: object) -> object:
+    raise UntrackableError("it is a box")
+
+
 def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     return torch.rad2deg(torch.acos((((a * b).sum((-1, -2)) - 1) / 2).clamp(-1, 1)))
 
@@ -92,7 +96,7 @@ def test_turning_and_shape_of_a_held_box() -> None:
     joints = joints + 0.02 * torch.randn(joints.shape, generator=torch.Generator().manual_seed(1))
     shown = around(images, objects, humans, joints)
     track, normals, confidence = tracked_object(
-        shown, 800, lambda _: None, levels=((5.0, 6, 60), (2.0, 2, 60))
+        watched(shown), 800, lambda _: None, levels=((5.0, 6, 60), (2.0, 2, 60))
     )
     rotations, places = poses(0.7)
     left, _, right = torch.linalg.svd((track.rotations.mT @ rotations).sum(0))
@@ -110,10 +114,7 @@ def test_what_has_no_texture_is_refused() -> None:
     rng = np.random.default_rng(0)
     noisy = np.clip(images + rng.normal(size=images.shape) * 4, 0, 255).astype(np.uint8)
     with pytest.raises(UntrackableError, match="texture"):
-        tracked_object(
-            around(noisy, objects, humans, joints), 99, lambda _: None,
-            levels=((5.0, 6, 20), (2.0, 2, 20)),
-        )  # fmt: skip
+        watched(around(noisy, objects, humans, joints))
 
 
 def test_what_is_seen_briefly_goes_the_old_way_by_name() -> None:
@@ -298,6 +299,7 @@ def test_a_shape_far_off_its_masks_is_refused(monkeypatch: pytest.MonkeyPatch) -
         return track, points, replace(ObjectConfidence.none("t", FRAMES, ""),
                                       outline=np.full(FRAMES, 0.1))  # fmt: skip
 
+    monkeypatch.setattr(making, "plate_object", not_flat)
     monkeypatch.setattr(making, "tracked_object", collapsed)
     made = make_object(
         None, around(images, objects, humans, joints), way="auto", radius=None, count=200,
@@ -327,6 +329,7 @@ def test_poses_that_leave_the_masks_lose_to_the_outlines(
         )
         return replace(good.track, translations=places), normals, confidence
 
+    monkeypatch.setattr(making, "plate_object", not_flat)
     monkeypatch.setattr(making, "tracked_object", moved)
     made = make_object(None, shown, way=way, **settings)  # type: ignore[arg-type]
     assert made.confidence.way == taken
