@@ -72,7 +72,7 @@ PLAN = {
         ("estimates", "cameras"),
         ("find_object", "body", "fit_steps", "person_height", "object_size", "chunk", "overlap"),
         slow=True,
-        version=6,
+        version=7,
     ),
     "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True),
     "objects": Stage(

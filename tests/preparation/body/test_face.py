@@ -68,7 +68,7 @@ def test_a_large_face_is_believed_the_less_the_smaller_it_is_in_the_image() -> N
     assert 1.05 < near.mean < 1.08
     assert 1.0 < far.mean < 1.04
     assert near.spread < far.spread < BODIES
-    odd = Faces(torch.full((9,), 1.6), torch.full((9,), 12.0))
+    odd = Faces(torch.full((9,), 1.6), torch.full((9,), 40.0))
     assert Size.by_face(1.0, torch.ones(9), odd) == Size()
     # what was found of a body that has that size already is the same
     again = Size.by_face(near.mean, torch.full((9,), near.mean), Faces(noses, torch.full((9,), 80)))
@@ -85,6 +85,6 @@ def test_a_person_with_a_large_face_is_larger_and_farther_off() -> None:
     # the nose is the body's own: move the face to it
     image[:, marks] = face[marks] + (seen.image[:, :1] - face[0]) * torch.tensor([1.0, 1, 0])
     larger = fit_body(body(), Observations(Landmarks(image, seen.world), cameras), QUICK)
-    assert larger.report["size"] > 1.02
+    assert larger.report["size"] > 1.01
     farther = larger.poses.transl[:, 2] / usual.poses.transl[:, 2]
     assert farther.mean() == pytest.approx(larger.report["size"], abs=0.015)
