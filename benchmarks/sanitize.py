@@ -4,7 +4,7 @@
     python benchmarks/sanitize.py --work          # what runs under the tool, without the tool
 
 Renders with and without feature channels, absolute gradients and room for the intersections, all
-with gradients, then SSIM with its gradient, under memcheck (memory out of
+with gradients, cameras with optics, then SSIM with its gradient, under memcheck (memory out of
 bounds), racecheck (shared memory written and read without a barrier) and synccheck (barriers that
 some threads of a block miss). torch takes its memory without its cache, which would hide what lies
 beyond an array. Exit code 1 if a tool finds anything, or cannot be run.
@@ -20,6 +20,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,7 @@ def work() -> int:
     import torch
 
     from hoigs.core.interfaces.rasterizer import RenderRequest
+    from hoigs.core.maths.optics import Optics
     from hoigs.metrics.kernels.ssim import mean_ssim, ssim_map
     from hoigs.rasterizers.warp import WarpRasterizer
     from hoigs.testing.rasterizer.subject import a_camera, random_gaussians
@@ -113,6 +115,20 @@ def work() -> int:
                     loss.backward()
                     torch.cuda.synchronize()
                     print(f"drawn {count} {channels} {absolute} {room} {float(loss):.6f}")
+    last = camera.world_to_camera.clone()
+    last[0, 3] += 0.02
+    rolling = {"shutter": "top_to_bottom", "last_world_to_camera": last}
+    for optics in (
+        Optics("fisheye", radial=(0.02, 0.001)),
+        Optics("ortho"),
+        Optics(radial=(0.05, 0.01), tangential=(0.001, 0.002), **rolling),
+    ):
+        seen = replace(camera, optics=optics)
+        leaves = random_gaussians(400).to(cuda).map(lambda x: x.detach().requires_grad_())
+        out = WarpRasterizer().render(leaves, seen)
+        (out.color.square().mean() + out.depth.mean()).backward()
+        torch.cuda.synchronize()
+        print(f"drawn {optics.model} {optics.shutter} {float(out.color.mean()):.6f}")
     image = torch.rand(61, 83, 3, device=cuda, requires_grad=True)
     target = torch.rand(61, 83, 3, device=cuda)
     score = mean_ssim(image, target)
