@@ -96,7 +96,7 @@ class RayCaster:
         self.shell = shell
         self.texels: wp.array = wp.array(atlas.texels, dtype=wp.vec3, device="cpu")
         self.levels: wp.array = wp.array(atlas.levels, dtype=wp.vec3i, device="cpu")
-        self.lights = _lights(light, room)
+        self.lights: Any = _lights(light, room)
         self.lights.mirror = mirror
         self.samples, self.edge_samples = samples, max(samples, edge_samples)
         offsets = pixel_samples(samples, self.edge_samples)
