@@ -107,8 +107,8 @@ BODIES = 0.065  # standard deviation of the logarithm of adults' size, 0.054 (Go
 FACES = 0.045  # of the same of faces, 0.035, and of what landmarks make of it
 # pixels between the outer corners of eyes in which nothing is left to measure; the error falls with
 # the square of their distance. Of seven films of faces of 13 to 18 pixels, the size was off by 24 %
-# (root mean square), on three of 60 to 70 by 6 %: fourviews as filmed and at a quarter of its width,
-# and five built-in clips, whose drawn faces mislead the networks besides.
+# (root mean square), on three of 60 to 70 by 6 %: fourviews as filmed and at a quarter of its
+# width, and five built-in clips, whose drawn faces mislead the networks besides.
 GUESSED = 7.0
 FEWEST = 5  # frames with a face
 ODD = 2.5  # standard deviations: a face that says more is one whose landmarks are wrong

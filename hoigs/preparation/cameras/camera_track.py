@@ -107,7 +107,7 @@ def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> Came
     (or from 1 if no image is numbered 0).
 
     Args:
-        partial: leave out frames that the model has no camera for.
+        partial: leave out frames that the model has no camera for, or one that lies astray.
 
     Raises:
         SourceError: the model is unreadable, lacks frames, or has cameras of several kinds.
@@ -119,6 +119,8 @@ def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> Came
     except (RuntimeError, ValueError, IndexError) as error:
         raise SourceError(f"{model} is not a readable COLMAP model: {error}") from error
     by_frame = _by_frame(model_read)
+    if partial:
+        by_frame = _without_astray(by_frame)
     missing = [i for i in video.indices if i not in by_frame]
     if missing and (not partial or len(missing) == len(video)):
         raise SourceError(
@@ -172,6 +174,18 @@ def _by_frame(model: Any) -> dict[int, Any]:
     if numbered and 0 not in numbered and 1 in numbered:
         return {number - 1: image for number, image in numbered.items()}
     return numbered
+
+
+ASTRAY = 100.0  # median distances of a camera from the middle of all: no path is so uneven
+
+
+def _without_astray(images: dict[int, Any]) -> dict[int, Any]:
+    """Without cameras that COLMAP registered far beyond all others, by a view with hardly any
+    points: the motion and depth of everything in such a frame would be as wrong."""
+    centers = np.array([image.projection_center() for image in images.values()])
+    away = np.linalg.norm(centers - np.median(centers, axis=0), axis=-1)
+    near = away <= ASTRAY * max(float(np.median(away)), np.finfo(float).tiny)
+    return {number: image for (number, image), kept in zip(images.items(), near) if kept}
 
 
 def _one_lens(path: Path, model: Any, used: set[int]) -> Lens:

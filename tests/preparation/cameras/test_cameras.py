@@ -135,3 +135,13 @@ def test_scaling_the_world_keeps_the_picture(tiny_video: Path, tmp_path: Path) -
     assert parallax(scaled, torch.tensor([0.55 * 0.37, 0, 4 * 0.37])) == pytest.approx(
         15.7, abs=0.2
     )
+
+
+def test_a_camera_far_beyond_all_others_is_none(tiny_video: Path, tmp_path: Path) -> None:
+    model = colmap_model(tmp_path / "sparse")
+    text = (model / "images.txt").read_text()
+    assert f"{-0.1 * 3} 0 0 1" in text
+    (model / "images.txt").write_text(text.replace(f"{-0.1 * 3} 0 0 1", "1e9 0 0 1"))
+    found = colmap_cameras(VideoFrames(tiny_video), model, partial=True)
+    assert found.positions == tuple(i for i in range(FRAMES) if i != 3)
+    assert len(colmap_cameras(VideoFrames(tiny_video), model).cameras) == FRAMES  # the user's own
