@@ -26,6 +26,7 @@ import argparse
 import io
 import json
 import os
+import shutil
 import tempfile
 import time
 from collections import Counter
@@ -79,10 +80,10 @@ def estimates_of(name: str, cache: Path) -> tuple[np.ndarray, np.ndarray | None]
         from hoigs.preparation.kept import last_kept
         from hoigs.preparation.prepare import prepare_until, work_folder
 
-        out = cache / "prepared" / name
-        prepare_until(
-            "estimates", recording(name), out, object="none", estimators="offline", yes=True
-        )
+        out, alone = cache / "prepared" / name, cache / "alone" / f"{name}.mp4"
+        alone.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(recording(name), alone)  # masks may lie beside it, and would be taken
+        prepare_until("estimates", alone, out, object="none", estimators="offline", yes=True)
         found = last_kept(work_folder(out), "estimates")["estimates"]
         masks = np.stack([found.masks.human[i] for i in range(len(found.masks.human))])
         arrays = {}
