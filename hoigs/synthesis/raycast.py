@@ -96,8 +96,7 @@ class RayCaster:
         self.shell = shell
         self.texels: wp.array = wp.array(atlas.texels, dtype=wp.vec3, device="cpu")
         self.levels: wp.array = wp.array(atlas.levels, dtype=wp.vec3i, device="cpu")
-        self.lights: Any = _lights(light, room)
-        self.lights.mirror = mirror
+        self.lights = _lights(light, room, mirror)
         self.samples, self.edge_samples = samples, max(samples, edge_samples)
         offsets = pixel_samples(samples, self.edge_samples)
         self.offsets: wp.array = wp.array(offsets, dtype=wp.vec2, device="cpu")
@@ -149,7 +148,9 @@ def _disc(count: int) -> Float[Array, "N 2"]:
     return np.stack((radius * np.cos(angle), radius * np.sin(angle)), -1)
 
 
-def _lights(light: LightConfig, room: tuple[Sequence[float], Sequence[float]]) -> Lights:
+def _lights(
+    light: LightConfig, room: tuple[Sequence[float], Sequence[float]], mirror: float
+) -> Lights:
     axis = np.asarray(light.sun_direction, float)
     axis /= np.linalg.norm(axis)
     side = np.cross(axis, [0.0, 0.0, 1.0] if abs(axis[2]) < 0.9 else [0.0, 1.0, 0.0])
@@ -165,6 +166,7 @@ def _lights(light: LightConfig, room: tuple[Sequence[float], Sequence[float]]) -
     lights.sky = wp.vec3(*(light.ambient * np.array([0.93, 0.97, 1.05])))
     lights.ground = wp.vec3(*(light.ambient * np.array([0.60, 0.53, 0.46])))
     lights.shadows, lights.occlusion = light.shadows, light.occlusion
+    lights.mirror = mirror
     lights.room_low, lights.room_high = wp.vec3(*room[0]), wp.vec3(*room[1])
     lights.suns = wp.array(suns[order].astype(np.float32), dtype=wp.vec3, device="cpu")
     lights.skies = wp.array(skies[order].astype(np.float32), dtype=wp.vec3, device="cpu")
