@@ -243,22 +243,33 @@ def shade(
 
 
 @wp.func
+def lit(
+    shell: Surface, things: Surface, texels: wp.array(dtype=wp.vec3),
+    levels: wp.array(dtype=wp.vec3i, ndim=2), lights: Lights, view: View, ray: wp.vec3, hit: Hit,
+    sample: int,
+):  # fmt: skip
+    """The light that a hit sends back by itself."""
+    if hit.layer == 0:
+        return shade(shell, things.mesh, texels, levels, lights, view, ray, hit, sample)
+    if hit.layer == 1:
+        return shade(things, things.mesh, texels, levels, lights, view, ray, hit, sample)
+    return Shade()
+
+
+@wp.func
 def radiance(
     shell: Surface, things: Surface, texels: wp.array(dtype=wp.vec3),
     levels: wp.array(dtype=wp.vec3i, ndim=2), lights: Lights, view: View, ray: wp.vec3, hit: Hit,
     sample: int,
 ):  # fmt: skip
-    if hit.layer == 0:
-        return shade(shell, things.mesh, texels, levels, lights, view, ray, hit, sample)
-    if hit.layer == 1:
-        own = shade(things, things.mesh, texels, levels, lights, view, ray, hit, sample)
-        if lights.mirror > 0.0 and things.entity[hit.face] == MIRROR:
+    own = lit(shell, things, texels, levels, lights, view, ray, hit, sample)
+    if lights.mirror > 0.0 and hit.layer == 1:  # noqa: SIM102  older Warps evaluate all of an `and`
+        if things.entity[hit.face] == MIRROR:
             own.value *= 1.0 - lights.mirror
             own.value += lights.mirror * reflected(
                 shell, things, texels, levels, lights, view, ray, hit, sample
             )
-        return own
-    return Shade()
+    return own
 
 
 @wp.func
@@ -270,17 +281,11 @@ def reflected(
     """What a flat mirror at the hit shows: one more ray, whose own mirrors are dull."""
     flat = wp.mesh_eval_face_normal(things.mesh, hit.face)
     second = view  # its eye is the mirror; distances along the first ray count for texture detail
-    second.eye = view.eye + ray * hit.t
     towards = wp.normalize(ray - flat * (2.0 * wp.dot(flat, ray)))
-    second.eye += towards * 2.0e-3
+    second.eye = view.eye + ray * hit.t + towards * 2.0e-3
     found = nearest(shell, things, second.eye, towards)
-    if found.layer == 0:
-        seen = shade(shell, things.mesh, texels, levels, lights, second, towards, found, sample)
-        return seen.value
-    if found.layer == 1:
-        seen = shade(things, things.mesh, texels, levels, lights, second, towards, found, sample)
-        return seen.value
-    return wp.vec3(0.0, 0.0, 0.0)
+    seen = lit(shell, things, texels, levels, lights, second, towards, found, sample)
+    return seen.value
 
 
 @wp.func

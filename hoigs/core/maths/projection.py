@@ -223,12 +223,8 @@ def _onto_screen(
     slopes = torch.minimum(torch.maximum(slopes, low), high)
     axes = rotation @ quats_to_matrices(quats) * log_scales.exp()[:, None, :]
     m = (focal * inverse_z[:, None])[..., None] * (axes[:, :2] - slopes[..., None] * axes[:, 2:])
-    m0, m1 = m.unbind(1)
-    xx, xy, yy = (m0 * m0).sum(-1), (m0 * m1).sum(-1), (m1 * m1).sum(-1)
-    area = torch.linalg.vector_norm(torch.linalg.cross(m0, m1), dim=-1)
-    # area^2 = xx yy - xy^2, by Lagrange's identity
-    det = area.square() + low_pass * (xx + yy) + low_pass * low_pass
-    covs = torch.stack((xx + low_pass, xy, yy + low_pass), -1)
+    area = torch.linalg.vector_norm(torch.linalg.cross(*m.unbind(1)), dim=-1)
+    covs, det = _blurred(m, area, low_pass)
     return cam, means2d, covs, area, det, torch.ones_like(det, dtype=torch.bool)
 
 
@@ -252,13 +248,25 @@ def _through_optics(
     if offsets is not None:
         means2d = means2d + offsets
     m0, m1 = root.unbind(1)
-    xx, xy, yy = (m0 * m0).sum(-1), (m0 * m1).sum(-1), (m1 * m1).sum(-1)
     i, j = torch.triu_indices(7, 7, 1, device=means.device)
     area = torch.linalg.vector_norm(m0[:, i] * m1[:, j] - m0[:, j] * m1[:, i], dim=-1)
-    # area^2 = xx yy - xy^2, by Lagrange's identity
-    det = area.square() + low_pass * (xx + yy) + low_pass * low_pass
-    covs = torch.stack((xx + low_pass, xy, yy + low_pass), -1)
+    covs, det = _blurred(root, area, low_pass)
     return cam, means2d, covs, area, det, seen
+
+
+def _blurred(
+    root: Float[Tensor, "M 2 R"], area: Float[Tensor, " M"], low_pass: float
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"]]:
+    """Screen covariances (xx, xy, yy) with the low-pass, and their determinants; square pixels.
+
+    Args:
+        root: rows m0, m1 of a square root of the covariances. area: sqrt(xx yy - xy^2) of these,
+            by Lagrange's identity the length of all 2x2 minors of the root.
+    """
+    m0, m1 = root.unbind(1)
+    xx, xy, yy = (m0 * m0).sum(-1), (m0 * m1).sum(-1), (m1 * m1).sum(-1)
+    det = area.square() + low_pass * (xx + yy) + low_pass * low_pass
+    return torch.stack((xx + low_pass, xy, yy + low_pass), -1), det
 
 
 def _extents(

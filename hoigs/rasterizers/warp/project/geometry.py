@@ -160,21 +160,30 @@ def onto_screen(
 @wp.func
 def is_regular(s: Screen, quat: wp.vec4, scale: wp.vec3, near: float) -> bool:
     """The culling rules about size and place; every comparison with NaN is false."""
+    return fits(s.cam, s.u, s.v, s.xx + s.yy, s.det, quat, scale, near)
+
+
+@wp.func
+def fits(
+    cam: wp.vec3, u: float, v: float, trace: float, det: float, quat: wp.vec4, scale: wp.vec3,
+    near: float,
+) -> bool:  # fmt: skip
+    """As `is_regular`, of any camera; trace and det are those of the covariance on the screen."""
     norm = wp.length(quat)
     return (
-        s.cam[2] > near
-        and s.cam[2] <= LIMIT
-        and wp.abs(s.cam[0]) <= LIMIT
-        and wp.abs(s.cam[1]) <= LIMIT
+        cam[2] > near
+        and cam[2] <= LIMIT
+        and wp.abs(cam[0]) <= LIMIT
+        and wp.abs(cam[1]) <= LIMIT
         and norm >= SMALLEST_QUAT
         and norm <= LARGEST_QUAT
         and scale[0] <= LIMIT
         and scale[1] <= LIMIT
         and scale[2] <= LIMIT
-        and wp.abs(s.u) <= LIMIT
-        and wp.abs(s.v) <= LIMIT
-        and s.xx + s.yy <= MAX_VARIANCE
-        and s.det >= MIN_DETERMINANT
+        and wp.abs(u) <= LIMIT
+        and wp.abs(v) <= LIMIT
+        and trace <= MAX_VARIANCE
+        and det >= MIN_DETERMINANT
     )
 
 

@@ -19,15 +19,7 @@ from hoigs.core.fast.launch import CPU_FLAGS
 from hoigs.core.maths import optics as rules
 from hoigs.core.system.quiet_warp import wp
 from hoigs.rasterizers.warp.frame import MOTION
-from hoigs.rasterizers.warp.project.geometry import (
-    LARGEST_QUAT,
-    LIMIT,
-    MAX_VARIANCE,
-    MIN_DETERMINANT,
-    SMALLEST_QUAT,
-    Raw,
-    quat_adjoint,
-)
+from hoigs.rasterizers.warp.project.geometry import Raw, fits, quat_adjoint
 from hoigs.rasterizers.warp.project.kernels import make_kernels
 from hoigs.rasterizers.warp.records import F32, POSE
 
@@ -380,24 +372,8 @@ def onto_screen(
 
 @wp.func
 def is_regular(s: OpticsScreen, quat: wp.vec4, scale: wp.vec3, near: float) -> bool:
-    """The culling rules about size and place; every comparison with NaN is false."""
-    norm = wp.length(quat)
-    return (
-        s.nearest > near
-        and s.cam[2] > near
-        and s.cam[2] <= LIMIT
-        and wp.abs(s.cam[0]) <= LIMIT
-        and wp.abs(s.cam[1]) <= LIMIT
-        and norm >= SMALLEST_QUAT
-        and norm <= LARGEST_QUAT
-        and scale[0] <= LIMIT
-        and scale[1] <= LIMIT
-        and scale[2] <= LIMIT
-        and wp.abs(s.u) <= LIMIT
-        and wp.abs(s.v) <= LIMIT
-        and s.xx + s.yy <= MAX_VARIANCE
-        and s.det >= MIN_DETERMINANT
-    )
+    """As `geometry.is_regular`; the nearest of the seven points is in front, too."""
+    return s.nearest > near and fits(s.cam, s.u, s.v, s.xx + s.yy, s.det, quat, scale, near)
 
 
 @wp.func
