@@ -297,19 +297,17 @@ def test_a_plugin_file_by_explicit_flag(tmp_path):
     assert line.split()[:3] == ["density:mine", "ok", "mine.py"]
 
 
-def test_the_listing_is_quick_and_light(installed):
+def test_the_listing_imports_nothing_heavy(installed):
     probe = (
-        "import sys, time; sys.argv = ['hoigs', 'plugins']; from hoigs.cli.main import app\n"
+        "import sys; sys.argv = ['hoigs', 'plugins']; from hoigs.cli.main import app\n"
         "try: app()\nexcept SystemExit: pass\n"
-        "print({'torch', 'warp', 'numpy'} & set(sys.modules) or 'light', time.process_time())"
+        "print({'torch', 'warp', 'numpy'} & set(sys.modules) or 'light')"
     )
     env = {**os.environ, "PYTHONPATH": str(installed)}
     done = subprocess.run(
         [sys.executable, "-c", probe], capture_output=True, text=True, check=True, env=env
     )
-    word, seconds = done.stdout.splitlines()[-1].rsplit(maxsplit=1)
-    # 0.3 s when this was written; of processor time, as other tests may run beside this one
-    assert word == "light" and float(seconds) < 0.8
+    assert done.stdout.splitlines()[-1] == "light"
     assert "deformation:b-spline" in done.stdout
 
 
