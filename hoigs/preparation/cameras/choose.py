@@ -162,6 +162,7 @@ def _static(
     motion: BackgroundMotion,
 ) -> ChosenCameras:
     figures, warnings, how = {}, _doubts(motion, options.camera == "static"), ""
+    part = None if options.camera == "static" else motion.still
     if motion.known:
         figures = {"displacement_px": round(motion.largest, 3)}
         how = (
@@ -174,6 +175,15 @@ def _static(
         track = static_cameras(video, pinhole(video, found.pixels), found.how)
         figures |= found.figures
         warnings += found.warnings
+    if part is not None:
+        places = range(part[0], part[1] + 1)
+        moved = [i for i in range(len(video)) if i not in places]
+        warnings.append(
+            f"the camera stands still in frames {part[0]}-{part[1]} and moves in the {len(moved)} "
+            f"others ({ranges(moved)}), which are left out (--camera static keeps them)"
+        )
+        cameras = track.cameras[part[0] : part[1] + 1]
+        track = replace(track, cameras=cameras, positions=tuple(places))
     track = replace(track, provenance=track.provenance + how, figures={**track.figures, **figures})
     return ChosenCameras(track, warnings=warnings)
 

@@ -45,23 +45,29 @@ def quiet_colmap() -> Iterator[None]:
         pycolmap.logging.minloglevel = level
 
 
-FRAMES = 6  # compared with the first; SIFT takes about half a second each
+FRAMES = 6  # compared with another one; SIFT takes about half a second each
 WIDTH = 640  # at which they are
 FEATURES, ENOUGH = 1500, 25  # of an image; matches that make a pair count
 STILL = 1.0  # pixels at WIDTH: codecs and rolling light move features by a few tenths
+INNER = 4  # compared frames between the first and the last, from which on those two may differ
+FEW = 8  # matches that may show a moved camera
+COHERENT = 0.3  # of a camera's shift: half of the matches that show it are so near to it
 MARGIN = 0.01  # of the width: masks are grown by it
 Features = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 128"]]
 
 
 @dataclass(frozen=True)
 class BackgroundMotion:
-    """Displacement of features outside the masks since the first frame.
+    """Displacement of features outside the masks since one frame: the first, or one in between
+    if those between the first and the last agree and these two do not.
 
     Attributes:
         displacement: pixels at a width of 640, the median over features, of each compared frame;
             NaN where too few features were found again.
         matches: features found again, of each compared frame.
-        features: in the first frame.
+        features: in that one frame.
+        still: places of the first and the last frame between which the camera stands still; None
+            if it does so in all frames or does not stand still.
         turns: degrees that the camera turns by at most between two compared frames. parallax:
             pixels by which the best turns miss four of five features at most, in the worst pair of
             frames: what only a camera that changes its place explains. NaN: not known.
@@ -70,6 +76,7 @@ class BackgroundMotion:
     displacement: Float[np.ndarray, " C"]
     matches: list[int]
     features: int
+    still: tuple[int, int] | None = None
     turns: float = np.nan
     parallax: float = np.nan
 
@@ -99,18 +106,21 @@ class BackgroundMotion:
 
 
 def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
-    """Compares frames spread over the video with the first one."""
+    """Compares frames spread over the video with the first one, or with one in between."""
     chosen = sorted(set(np.linspace(0, len(video) - 1, FRAMES + 1).round().astype(int).tolist()))
     found = list(background_features(video, masks, chosen))
-    displacement, matches = [], []
-    for other in found[1:]:
-        one, two = paired(found[0], other)
-        matches.append(len(one))
-        moved = np.linalg.norm(one - two, axis=-1)
-        displacement.append(float(np.median(moved)) if len(one) >= ENOUGH else np.nan)
-    motion = BackgroundMotion(np.array(displacement), matches, len(found[0][0]))
+    motion, reference = _since(found, 0), found[0]
+    inner = found[1:-1]
+    if not motion.static and len(inner) >= INNER:
+        # a hand that starts and stops the recording moves the first and the last frames alone
+        every = [_since(inner, i) for i in range(len(inner))]
+        still = [i for i, m in enumerate(every) if m.known and m.static and m.largest < STILL]
+        if still:
+            best = min(still, key=lambda i: every[i].largest)
+            motion, reference = every[best], inner[best]
     if motion.static:
-        return motion
+        compared = list(zip(chosen, found, strict=True))
+        return replace(motion, still=_still_part(video, masks, compared, reference))
     size = (WIDTH, round(video.height * WIDTH / video.width))
     near = [paired(one, other) for one, other in pairwise(found)]
     far = [paired(found[0], other) for other in found[2:]]
@@ -118,6 +128,74 @@ def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
         return motion
     parallax, turns = turn_misses([p for p in (*near, *far) if len(p[0]) >= ENOUGH], size)
     return replace(motion, turns=turns, parallax=parallax)
+
+
+def _since(found: Sequence[Features], reference: int) -> BackgroundMotion:
+    """The motion of all others since one of them."""
+    pairs = [paired(found[reference], f) for i, f in enumerate(found) if i != reference]
+    shifts = [_shift(pair) if len(pair[0]) >= ENOUGH else np.nan for pair in pairs]
+    matches = [len(one) for one, _ in pairs]
+    return BackgroundMotion(np.array(shifts), matches, len(found[reference][0]))
+
+
+def _shift(pair: Pair) -> float:
+    """The median displacement, pixels."""
+    return float(np.median(np.linalg.norm(pair[0] - pair[1], axis=-1)))
+
+
+def _still_part(
+    video: Frames, masks: GivenMasks, compared: Sequence[tuple[int, Features]], reference: Features
+) -> tuple[int, int] | None:
+    """Places of the frames between which the camera does not move, if it moves at an end.
+
+    Args:
+        compared: places of frames, the first and the last among them, and their features.
+        reference: those of a frame in which the camera stands still.
+    """
+    first = _still_towards(video, masks, compared[::-1], reference)
+    last = _still_towards(video, masks, compared, reference)
+    whole = compared[0][0], compared[-1][0]
+    return None if (first, last) == whole else (first, last)
+
+
+def _still_towards(
+    video: Frames, masks: GivenMasks, compared: Sequence[tuple[int, Features]], reference: Features
+) -> int:
+    """The place of the frame towards the last compared one up to which the camera stands still.
+
+    A last frame whose background is hidden counts as one: nothing says that the camera moved. If
+    it did, the frame is searched for by halves, as features of a frame cost half a second.
+    """
+    places = [place for place, _ in compared]
+    still = [k for k, (_, features) in enumerate(compared) if _stays(reference, features)]
+    end = len(compared) - 1
+    if not still or still[-1] == end or not _moved(paired(reference, compared[end][1])):
+        return places[end]
+    inside, outside = places[still[-1]], places[still[-1] + 1]
+    while abs(outside - inside) > 1:
+        middle = (inside + outside) // 2
+        (features,) = background_features(video, masks, [middle])
+        if _stays(reference, features):
+            inside = middle
+        else:
+            outside = middle
+    return inside
+
+
+def _stays(reference: Features, features: Features) -> bool:
+    pair = paired(reference, features)
+    return len(pair[0]) >= ENOUGH and _shift(pair) < STILL
+
+
+def _moved(pair: Pair) -> bool:
+    """Whether the background was seen to move as one, which wrong matches do not."""
+    if len(pair[0]) < FEW:
+        return False
+    steps = pair[1] - pair[0]
+    shift = np.median(steps, axis=0)
+    length = float(np.linalg.norm(shift))
+    spread = float(np.median(np.linalg.norm(steps - shift, axis=-1)))
+    return length >= STILL and spread < STILL + COHERENT * length
 
 
 def background_features(

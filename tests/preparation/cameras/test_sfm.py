@@ -89,6 +89,23 @@ def test_a_camera_that_stands_still(tmp_path: Path) -> None:
     assert chosen.track.figures["displacement_px"] < 0.5
 
 
+def test_a_camera_that_is_let_go_and_taken_up(tmp_path: Path) -> None:
+    """A hand starts and stops the recording: the frames in which it moves the camera go."""
+    eyes = [0.12, 0.06, *[0.0] * 20, 0.1, 0.3]
+    video, masks = recorded(tmp_path / "touched", eyes, block=False)
+    motion = background_motion(video, masks)
+    assert motion.static and motion.largest < 0.5 and motion.still == (2, 21)
+    chosen = cameras_of(video, masks, tmp_path, focal=FOCAL)
+    assert chosen.track.static and chosen.track.positions == tuple(range(2, 22))
+    assert any("0-1, 22-23" in warning for warning in chosen.warnings)
+    declared = cameras_of(video, masks, tmp_path, focal=FOCAL, camera="static")
+    assert len(declared.track.positions) == 24
+
+    hidden = MaskStack([np.full((HEIGHT, WIDTH), i > 20) for i in range(24)])
+    motion = background_motion(video, GivenMasks(together=hidden))
+    assert motion.static and motion.still == (2, 23), "nothing shows that the last frames moved"
+
+
 def test_a_camera_that_moves_and_one_that_shows_nothing(tmp_path: Path) -> None:
     video, masks = recorded(tmp_path / "moves", [0.08 * i for i in range(COUNT)])
     motion = background_motion(video, masks)
