@@ -37,12 +37,16 @@ from hoigs.preparation.video.source import NobodyFoundError, Source, SourceError
 from hoigs.preparation.work_folder import digest
 
 RARE = 0.05  # of the frames: what is taken for a person in fewer of them is none
+SHY = 0.2  # the same, of what no frame shows at the first look
 
 
 def chosen_landmarks(
-    track: estimator.Landmarks, video: Frames, what: str, source: str = "MediaPipe"
+    track: estimator.Landmarks, video: Frames, what: str, source: str, clicked: bool
 ) -> Landmarks:
     """Landmarks of a whole video, in its own pixels, as those of the chosen frames, at their size.
+
+    Args:
+        clicked: somebody said where the person is, who may then be hard to find.
 
     Raises:
         NobodyFoundError: no person is found in them; `what` names where they come from.
@@ -58,7 +62,9 @@ def chosen_landmarks(
         torch.from_numpy(image), torch.from_numpy(world), source, fates, track.to_hips
     )
     count, frames = int(found.found.sum()), len(image)
-    if count < RARE * frames:
+    at_once = found.found.clone()
+    at_once[fates.repaired_frames()] = False  # animals are found at further looks alone
+    if count < (RARE if clicked or at_once.any() else SHY) * frames:
         why = "; ".join(f"{text} in {len(rows)}" for text, rows in fates.lost.items())
         raise NobodyFoundError(
             f"{what}: no person was found in "
@@ -362,7 +368,8 @@ class EstimateReader:
             raise SourceError(f"{who} gave landmarks of {_listed(tracks)}, not of {name}")
         if len(self.people) > 1:
             who += f", {name}"
-        return chosen_landmarks(tracks[name], self.video, who, tracks[name].provenance or "given")
+        source, clicked = tracks[name].provenance or "given", name in self.prompts
+        return chosen_landmarks(tracks[name], self.video, who, source, clicked)
 
     def _masks(self, names: tuple[str, str], progress: Callable[[float], None]) -> GivenMasks:
         found = self.estimate("masks", progress).masks

@@ -15,9 +15,15 @@ from hoigs.core.interfaces.estimator import Estimates, Estimator, Landmarks
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation.estimates.installed import load_options
+from hoigs.preparation.estimates.reader import chosen_landmarks
 from hoigs.preparation.prepare import PrepareOptions, prepare, prepare_until, work_folder
 from hoigs.preparation.video.frames import Choice, FolderFrames, VideoFrames, open_frames
-from hoigs.preparation.video.source import SourceError, find_source, numbered_frames
+from hoigs.preparation.video.source import (
+    NobodyFoundError,
+    SourceError,
+    find_source,
+    numbered_frames,
+)
 
 QUICK = ["fit_steps=3", "overlay_width=0"]
 
@@ -204,3 +210,21 @@ def test_commands_of_options_need_permission(tiny_source: Path, tmp_path: Path) 
             allow_commands=True,
         )  # fmt: skip
     assert mark.exists()
+
+
+def test_who_is_found_in_few_frames_and_never_at_once_is_nobody(tmp_path: Path) -> None:
+    """A cat is taken for a person in a tenth of the frames, all of them at a second look."""
+    for i in range(20):
+        Image.fromarray(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).save(tmp_path / f"{i:02d}.png")
+    video = open_frames(tmp_path)
+    image = np.full((20, 33, 4), np.nan, np.float32)
+    image[[8, 9]] = 1.0
+    late = Landmarks(image, None, repaired={"a second look": [8, 9]})
+    with pytest.raises(NobodyFoundError, match="in 18 of the 20 chosen frames"):
+        chosen_landmarks(late, video, "late", "given", clicked=False)
+    assert chosen_landmarks(late, video, "late", "given", clicked=True).found.sum() == 2
+    once = Landmarks(image, None, repaired={"a second look": [3, 8]})
+    assert chosen_landmarks(once, video, "once", "given", clicked=False).found.sum() == 2
+    image[4:8] = 1.0
+    often = Landmarks(image, None, repaired={"a second look": list(range(4, 10))})
+    assert chosen_landmarks(often, video, "often", "given", clicked=False).found.sum() == 6
