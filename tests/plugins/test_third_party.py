@@ -297,17 +297,19 @@ def test_a_plugin_file_by_explicit_flag(tmp_path):
     assert line.split()[:3] == ["density:mine", "ok", "mine.py"]
 
 
-def test_the_listing_imports_nothing_heavy(installed):
+def test_the_listing_is_quick_and_light(installed):
     probe = (
         "import sys; sys.argv = ['hoigs', 'plugins']; from hoigs.cli.main import app\n"
         "try: app()\nexcept SystemExit: pass\n"
-        "print({'torch', 'warp', 'numpy'} & set(sys.modules) or 'light')"
+        "print({'torch', 'warp', 'numpy'} & set(sys.modules) or 'light', len(sys.modules))"
     )
     env = {**os.environ, "PYTHONPATH": str(installed)}
     done = subprocess.run(
         [sys.executable, "-c", probe], capture_output=True, text=True, check=True, env=env
     )
-    assert done.stdout.splitlines()[-1] == "light"
+    word, modules = done.stdout.splitlines()[-1].rsplit(maxsplit=1)
+    # 382 when this was written, in 0.3 s; what makes a listing slow is what it imports
+    assert word == "light" and int(modules) < 600
     assert "deformation:b-spline" in done.stdout
 
 

@@ -162,7 +162,6 @@ def _static(
     motion: BackgroundMotion,
 ) -> ChosenCameras:
     figures, warnings, how = {}, _doubts(motion, options.camera == "static"), ""
-    part = None if options.camera == "static" else motion.still
     if motion.known:
         figures = {"displacement_px": round(motion.largest, 3)}
         how = (
@@ -175,15 +174,19 @@ def _static(
         track = static_cameras(video, pinhole(video, found.pixels), found.how)
         figures |= found.figures
         warnings += found.warnings
-    if part is not None:
-        places = range(part[0], part[1] + 1)
-        moved = [i for i in range(len(video)) if i not in places]
-        warnings.append(
-            f"the camera stands still in frames {part[0]}-{part[1]} and moves in the {len(moved)} "
-            f"others ({ranges(moved)}), which are left out (--camera static keeps them)"
+    if motion.still is not None:
+        first, last = motion.still
+        moved = [i for i in range(len(video)) if not first <= i <= last]
+        said = (
+            f"the camera stands still in frames {first}-{last} alone: the background of the "
+            f"{len(moved)} others ({ranges(moved)}) has moved or is hidden"
         )
-        cameras = track.cameras[part[0] : part[1] + 1]
-        track = replace(track, cameras=cameras, positions=tuple(places))
+        if options.camera == "static":
+            warnings.append(f"{said}, and is blurred by them, as the camera was declared static")
+        else:
+            warnings.append(f"{said}, and they are left out (--camera static keeps them)")
+            cameras, positions = track.cameras[first : last + 1], tuple(range(first, last + 1))
+            track = replace(track, cameras=cameras, positions=positions)
     track = replace(track, provenance=track.provenance + how, figures={**track.figures, **figures})
     return ChosenCameras(track, warnings=warnings)
 

@@ -131,7 +131,7 @@ def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
 
 
 def _since(found: Sequence[Features], reference: int) -> BackgroundMotion:
-    """The motion of all others since one of them."""
+    """The motion of all frames but one since that one; `reference` is its place in `found`."""
     pairs = [paired(found[reference], f) for i, f in enumerate(found) if i != reference]
     shifts = [_shift(pair) if len(pair[0]) >= ENOUGH else np.nan for pair in pairs]
     matches = [len(one) for one, _ in pairs]
@@ -183,6 +183,7 @@ def _still_towards(
 
 
 def _stays(reference: Features, features: Features) -> bool:
+    """Whether the background is seen where it is in the frame of the reference."""
     pair = paired(reference, features)
     return len(pair[0]) >= ENOUGH and _shift(pair) < STILL
 

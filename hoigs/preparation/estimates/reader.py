@@ -41,12 +41,14 @@ SHY = 0.2  # the same, of what no frame shows at the first look
 
 
 def chosen_landmarks(
-    track: estimator.Landmarks, video: Frames, what: str, source: str, clicked: bool
+    track: estimator.Landmarks, video: Frames, what: str, source: str, placed: bool
 ) -> Landmarks:
     """Landmarks of a whole video, in its own pixels, as those of the chosen frames, at their size.
 
     Args:
-        clicked: somebody said where the person is, who may then be hard to find.
+        track: image [F, 33, 4] in pixels of the video, world [F, 33, 4] in metres.
+        what, source: the estimator, for an error, and where it has the landmarks from.
+        placed: a click, or the search for people, says where this one is, who may be hard to see.
 
     Raises:
         NobodyFoundError: no person is found in them; `what` names where they come from.
@@ -64,7 +66,7 @@ def chosen_landmarks(
     count, frames = int(found.found.sum()), len(image)
     at_once = found.found.clone()
     at_once[fates.repaired_frames()] = False  # animals are found at further looks alone
-    if count < (RARE if clicked or at_once.any() else SHY) * frames:
+    if count < (RARE if placed or at_once.any() else SHY) * frames:
         why = "; ".join(f"{text} in {len(rows)}" for text, rows in fates.lost.items())
         raise NobodyFoundError(
             f"{what}: no person was found in "
@@ -368,8 +370,8 @@ class EstimateReader:
             raise SourceError(f"{who} gave landmarks of {_listed(tracks)}, not of {name}")
         if len(self.people) > 1:
             who += f", {name}"
-        source, clicked = tracks[name].provenance or "given", name in self.prompts
-        return chosen_landmarks(tracks[name], self.video, who, source, clicked)
+        source, placed = tracks[name].provenance or "given", name in self.prompts
+        return chosen_landmarks(tracks[name], self.video, who, source, placed)
 
     def _masks(self, names: tuple[str, str], progress: Callable[[float], None]) -> GivenMasks:
         found = self.estimate("masks", progress).masks

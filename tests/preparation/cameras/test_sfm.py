@@ -100,6 +100,7 @@ def test_a_camera_that_is_let_go_and_taken_up(tmp_path: Path) -> None:
     assert any("0-1, 22-23" in warning for warning in chosen.warnings)
     declared = cameras_of(video, masks, tmp_path, focal=FOCAL, camera="static")
     assert len(declared.track.positions) == 24
+    assert any("0-1, 22-23" in w and "blurred" in w for w in declared.warnings)
 
     hidden = MaskStack([np.full((HEIGHT, WIDTH), i > 20) for i in range(24)])
     motion = background_motion(video, GivenMasks(together=hidden))

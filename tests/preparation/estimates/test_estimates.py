@@ -221,10 +221,10 @@ def test_who_is_found_in_few_frames_and_never_at_once_is_nobody(tmp_path: Path) 
     image[[8, 9]] = 1.0
     late = Landmarks(image, None, repaired={"a second look": [8, 9]})
     with pytest.raises(NobodyFoundError, match="in 18 of the 20 chosen frames"):
-        chosen_landmarks(late, video, "late", "given", clicked=False)
-    assert chosen_landmarks(late, video, "late", "given", clicked=True).found.sum() == 2
+        chosen_landmarks(late, video, "late", "given", placed=False)
+    assert chosen_landmarks(late, video, "late", "given", placed=True).found.sum() == 2
     once = Landmarks(image, None, repaired={"a second look": [3, 8]})
-    assert chosen_landmarks(once, video, "once", "given", clicked=False).found.sum() == 2
+    assert chosen_landmarks(once, video, "once", "given", placed=False).found.sum() == 2
     image[4:8] = 1.0
     often = Landmarks(image, None, repaired={"a second look": list(range(4, 10))})
-    assert chosen_landmarks(often, video, "often", "given", clicked=False).found.sum() == 6
+    assert chosen_landmarks(often, video, "often", "given", placed=False).found.sum() == 6
