@@ -74,7 +74,7 @@ PLAN = {
         slow=True,
         version=7,
     ),
-    "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True),
+    "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True, version=2),
     "objects": Stage(
         40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=4
     ),

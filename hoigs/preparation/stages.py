@@ -339,7 +339,8 @@ def masks(
             sources, draft.undistorted.further, draft.found_object, draft.track,
             keep_black=options.keep_black,
         )  # fmt: skip
-        return draft.noting(blank_warning(found.blank), {"masks": text}, masks=found)
+        warnings = blank_warning(found.blank, draft.track.undistort.outside)
+        return draft.noting(warnings, {"masks": text}, masks=found)
 
     return kept(draft, "masks", options, make)
 

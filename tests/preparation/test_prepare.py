@@ -13,11 +13,12 @@ import pytest
 import torch
 from PIL import Image
 from test_cameras import FOCAL, colmap_model
-from tiny import BALL, FRAMES, WIDTH, background, landmarks, make_source, masks
+from tiny import BALL, FRAMES, HEIGHT, WIDTH, background, landmarks, make_source, masks
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import ClipError, HoigsError, SpecError
 from hoigs.core.values.clip import Clip
+from hoigs.core.values.lens import Lens
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation import stages
@@ -58,6 +59,24 @@ def prepared(
     report = prepare(source, out, body=body, options=PrepareOptions(**{**QUICK, **options}))  # type: ignore[arg-type]
     assert check_clip(out) == []
     return ClipFolderReader().read(out), report
+
+
+@pytest.mark.parametrize("keep_black", [False, True])
+def test_pixels_that_the_lens_does_not_show_are_ignored(
+    tiny_source: Path, tmp_path: Path, body: AnnyBody, keep_black: bool
+) -> None:
+    """Of a lens with pincushion distortion, the undistorted image has empty corners."""
+    K = np.array([[FOCAL, 0, WIDTH / 2 - 0.5], [0, FOCAL, HEIGHT / 2 - 0.5], [0, 0, 1]])
+    k = (0.3, 0.0, 0.0, 0.0)  # as OpenCV has them, whose first pixel is at 0
+    intrinsics = (FOCAL, FOCAL, K[0, 2], K[1, 2], *k)
+    options = {"intrinsics": intrinsics, "camera": "static", "keep_black": keep_black}
+    clip, report = prepared(tiny_source, tmp_path / "clip", body, **options)
+    outside = Lens.opencv(K, k, WIDTH, HEIGHT, pixel_center=0).undistortion().outside
+    assert outside is not None and 0.02 < outside.mean() < 0.5
+    for frame in clip:
+        assert (frame.ignored.numpy() == outside).all()
+        assert not any((mask.numpy() & outside).any() for mask in frame.masks.values())
+    assert not any("black" in warning for warning in report.warnings)
 
 
 def test_static_camera_and_ball(
