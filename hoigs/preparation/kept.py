@@ -65,7 +65,10 @@ PLAN = {
         30, ("estimates",), ("object_name", "further_objects"), slow=True, version=7
     ),
     "cameras": Stage(
-        3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration"), version=4
+        3,
+        ("frames", "estimates"),
+        ("camera", "focal", "intrinsics", "calibration", "keep_borders"),
+        version=4,
     ),
     "people": Stage(
         46,
