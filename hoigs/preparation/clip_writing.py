@@ -155,8 +155,8 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
         name=name,
         video=draft.source.video.name,
         frames=len(draft.video),
-        width=draft.video.width,
-        height=draft.video.height,
+        width=draft.cameras[0].width,
+        height=draft.cameras[0].height,
         fps=draft.video.fps,
         camera=draft.track.kind,
         parallax_degrees=parallax(draft.cameras, middle),
@@ -227,10 +227,10 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
 
 
 def _focal_range(draft: Draft) -> tuple[float, float] | None:
-    figures, width = draft.track.figures, draft.video.native_width
+    figures, video = draft.track.figures, draft.video
     if "focal_low_px" not in figures:
         return None
-    pixels = float(draft.cameras[0].K[0, 0]) * width / draft.cameras[0].width
+    pixels = float(draft.cameras[0].K[0, 0]) * video.native_width / video.width
     low, high = (figures[f"focal_{end}_px"] / pixels for end in ("low", "high"))
     return round(low, 3), round(high, 3)
 

@@ -424,6 +424,7 @@ def final_masks(
     Args:
         others: of further people.
         found: objects that were followed in the video, the first and further ones.
+        track: cameras; pixels that their lens does not show are blank.
         keep_black: take flat black patches for a part of the scene.
     """
     human, object_masks, text = entity_masks(sources)
@@ -436,6 +437,8 @@ def final_masks(
     people = without_others(others, human, things)
     shown = [human, *people.values(), *things]
     blank = _nothing(human) if keep_black else _blank(sources.images, shown)
+    if (outside := track.undistort.outside) is not None:
+        blank = MaskStack(mask | outside for mask in blank)
     return EntityMasks(human, object_masks, blank, further, people), text
 
 
@@ -470,9 +473,10 @@ def _blank(images: Images, entities: Sequence[MaskStack]) -> MaskStack:
     )
 
 
-def blank_warning(blank: MaskStack) -> list[str]:
-    """A sentence, if any pixel is blank."""
-    coverage = blank.coverage()
+def blank_warning(blank: MaskStack, outside: Bool[np.ndarray, "H W"] | None) -> list[str]:
+    """A sentence, if any pixel is blank that is not `outside` of what the lens shows."""
+    patches = blank if outside is None else MaskStack(mask & ~outside for mask in blank)
+    coverage = patches.coverage()
     if not coverage.any():
         return []
     return [

@@ -65,7 +65,10 @@ PLAN = {
         30, ("estimates",), ("object_name", "further_objects"), slow=True, version=7
     ),
     "cameras": Stage(
-        3, ("frames", "estimates"), ("camera", "focal", "intrinsics", "calibration"), version=4
+        3,
+        ("frames", "estimates"),
+        ("camera", "focal", "intrinsics", "calibration", "keep_borders"),
+        version=4,
     ),
     "people": Stage(
         46,
@@ -74,7 +77,7 @@ PLAN = {
         slow=True,
         version=7,
     ),
-    "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True),
+    "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True, version=2),
     "objects": Stage(
         40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=4
     ),

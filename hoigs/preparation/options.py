@@ -123,6 +123,11 @@ class PrepareOptions(Options):
         description="The lens, in a file of COLMAP, OpenCV, Qualisys or Pose2Sim; FILE#NAME where"
         " the file holds several.",
     )
+    keep_borders: bool = Field(
+        default=False,
+        description="With a distorted lens: make undistorted frames so large, at most twice, that "
+        "they show all that the video shows; default: the video's own size, and borders are lost.",
+    )
     body: str = Field(default="body:anny", description="key of the body model, for the clip")
     person_height: float | None = Field(
         default=None,
@@ -265,8 +270,9 @@ class PrepareOptions(Options):
 
     shown: ClassVar = (
         "object", "person", "preset", "yes", "width", "camera", "max_frames", "every", "fps",
-        "start", "end", "focal", "intrinsics", "calibration", "person_height", "chunk", "overlap",
-        "keep_black", "overwrite", "overrides", "file", "allow_commands", "redo",
+        "start", "end", "focal", "intrinsics", "calibration", "keep_borders", "person_height",
+        "chunk", "overlap", "keep_black", "overwrite", "overrides", "file", "allow_commands",
+        "redo",
     )  # fmt: skip
 
     @classmethod

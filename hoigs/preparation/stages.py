@@ -267,9 +267,8 @@ def cameras(
             draft.video, draft.estimates.person, draft.estimates.masks,
             BesideVideo(source.colmap, source.cameras, draft.body_file), options, folder, progress,
         )  # fmt: skip
-        return draft.noting(
-            chosen.warnings, {"cameras": chosen.track.provenance}, track=chosen.track
-        )
+        track = chosen.track.with_borders() if options.keep_borders else chosen.track
+        return draft.noting(chosen.warnings, {"cameras": track.provenance}, track=track)
 
     found = kept(draft, "cameras", options, make, files)
     shutil.rmtree(folder, ignore_errors=True)
@@ -339,7 +338,8 @@ def masks(
             sources, draft.undistorted.further, draft.found_object, draft.track,
             keep_black=options.keep_black,
         )  # fmt: skip
-        return draft.noting(blank_warning(found.blank), {"masks": text}, masks=found)
+        warnings = blank_warning(found.blank, draft.track.undistort.outside)
+        return draft.noting(warnings, {"masks": text}, masks=found)
 
     return kept(draft, "masks", options, make)
 

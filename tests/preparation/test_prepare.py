@@ -13,11 +13,12 @@ import pytest
 import torch
 from PIL import Image
 from test_cameras import FOCAL, colmap_model
-from tiny import BALL, FRAMES, WIDTH, background, landmarks, make_source, masks
+from tiny import BALL, FRAMES, HEIGHT, WIDTH, background, landmarks, make_source, masks
 
 from hoigs.core.clip_folder.check import check_clip
 from hoigs.core.errors import ClipError, HoigsError, SpecError
 from hoigs.core.values.clip import Clip
+from hoigs.core.values.lens import Lens
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.preparation import stages
@@ -58,6 +59,55 @@ def prepared(
     report = prepare(source, out, body=body, options=PrepareOptions(**{**QUICK, **options}))  # type: ignore[arg-type]
     assert check_clip(out) == []
     return ClipFolderReader().read(out), report
+
+
+def test_borders_of_a_distorted_video_are_kept_if_asked(
+    tiny_source: Path, tmp_path: Path, body: AnnyBody
+) -> None:
+    """Of a lens with barrel distortion, the undistorted image is larger than the frame."""
+    intrinsics = (60.0, 60.0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, -0.15, 0.0, 0.0, 0.0)
+    options = {"intrinsics": intrinsics, "camera": "static"}
+    cut, _ = prepared(tiny_source, tmp_path / "cut", body, **options)
+    clip, report = prepared(tiny_source, tmp_path / "whole", body, keep_borders=True, **options)
+    small, large = cut.cameras[0], clip.cameras[0]
+    left, top = ((a - b) // 2 for a, b in ((large.width, WIDTH), (large.height, HEIGHT)))
+    assert (small.width, small.height) == (WIDTH, HEIGHT) and left > 4 and top > 2
+    assert (report.width, report.height) == (large.width, large.height)
+    assert torch.equal(large.cropped(left, top, WIDTH, HEIGHT).K, small.K)
+    inner = slice(top, top + HEIGHT), slice(left, left + WIDTH)
+    for one, other in zip(clip, cut, strict=True):
+        assert (one.image[inner].float() - other.image.float()).abs().mean() < 1.5
+        assert (one.masks["human"][inner] == other.masks["human"]).float().mean() > 0.99
+        assert one.ignored is not None and not one.ignored[inner].any() and one.ignored[0, 0]
+        ball, same = (c.objects["object"].translations[one.position] for c in (clip, cut))
+        moved = one.camera.project(ball)[0] - other.camera.project(same)[0]
+        assert (moved - torch.tensor([left, top])).abs().max() < 0.5
+    # the corners of the video's frame have a place, and the colours of the ramp there
+    lens = Lens("OPENCV", (60.0, 60.0, WIDTH / 2, HEIGHT / 2, -0.15, 0.0, 0.0, 0.0), WIDTH, HEIGHT)
+    corners = np.array([[2.5, 2.5], [WIDTH - 2.5, HEIGHT - 2.5]])
+    places = lens.undistortion().pixels(corners) + np.array([left, top])
+    for corner, place in zip(corners.astype(int), places.astype(int), strict=True):
+        assert not clip[0].ignored[place[1], place[0]]
+        shown = clip[0].image[place[1], place[0]].numpy().astype(float)
+        assert np.abs(shown - background()[corner[1], corner[0]]).max() < 12
+
+
+@pytest.mark.parametrize("keep_black", [False, True])
+def test_pixels_that_the_lens_does_not_show_are_ignored(
+    tiny_source: Path, tmp_path: Path, body: AnnyBody, keep_black: bool
+) -> None:
+    """Of a lens with pincushion distortion, the undistorted image has empty corners."""
+    K = np.array([[FOCAL, 0, WIDTH / 2 - 0.5], [0, FOCAL, HEIGHT / 2 - 0.5], [0, 0, 1]])
+    k = (0.3, 0.0, 0.0, 0.0)  # as OpenCV has them, whose first pixel is at 0
+    intrinsics = (FOCAL, FOCAL, K[0, 2], K[1, 2], *k)
+    options = {"intrinsics": intrinsics, "camera": "static", "keep_black": keep_black}
+    clip, report = prepared(tiny_source, tmp_path / "clip", body, **options)
+    outside = Lens.opencv(K, k, WIDTH, HEIGHT, pixel_center=0).undistortion().outside
+    assert outside is not None and 0.02 < outside.mean() < 0.5
+    for frame in clip:
+        assert (frame.ignored.numpy() == outside).all()
+        assert not any((mask.numpy() & outside).any() for mask in frame.masks.values())
+    assert not any("black" in warning for warning in report.warnings)
 
 
 def test_static_camera_and_ball(

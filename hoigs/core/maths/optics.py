@@ -23,8 +23,17 @@ at the place (u, v) that solves
     (u, v) = place of X(tau),  tau = clamp(a u + b v + c, 0, 1),
     X(tau) = Exp((tau - 1/2) w) R x + t + (tau - 1/2) d,  R, t of the middle, (w, d) the motion
 
-by fixed-point iterations from tau = 1/2. Depth, `near` and the direction of view are those of the
-pose in the middle.
+by Newton's iteration, kept within [0, 1], from tau = 1/2 for the mean of a Gaussian (or a single
+point) and from the mean's tau for its other six points:
+
+    tau <- clamp(tau + (a u + b v + c - tau) / slope, 0, 1),  slope = 1 - d(a u + b v) / dtau
+
+or with a slope of 1, as a fixed-point iteration, where the slope is not positive: where the point
+moves along with the shutter, and faster. The iteration stops after a step of less than
+SHUTTER_TOLERANCE of a row, whose error is of the order of its square. A point that has not stopped
+after SHUTTER_ITERATIONS steps has no place: it moves about as fast as the shutter, which sees it in
+many rows or in none. Gradients are those of the implicit function theorem. Depth, `near` and the
+direction of view are those of the pose in the middle.
 
 **Gaussians.** The unscented transform of 3DGUT (Wu et al., CVPR 2025, arXiv:2412.12507), with
 gsplat's parameters alpha = 0.1, beta = 2, kappa = 0 (Wan and van der Merwe 2000). With
@@ -51,6 +60,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from hoigs.core.errors import CameraError, did_you_mean
 from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
@@ -63,7 +73,8 @@ COEFFICIENTS = {"pinhole": (6, 2, 4), "ortho": (0, 0, 0), "fisheye": (4, 0, 0)}
 ALPHA, BETA, KAPPA = 0.1, 2.0, 0.0
 STEP = ALPHA * math.sqrt(3.0 + KAPPA)  # standard deviations from the mean to the other six points
 BEND = BETA - ALPHA * ALPHA  # weight of the shift in the covariance
-SHUTTER_ITERATIONS = 10  # gsplat's; each takes a tenth of the error for a tenth of a frame moved
+SHUTTER_ITERATIONS = 10  # at most; two or three are taken where a frame moves by a tenth
+SHUTTER_TOLERANCE = 0.01  # rows
 SMALL_SLOPE = 1e-4  # of s, below which the arctangent is a series
 
 
@@ -243,24 +254,58 @@ def world_points_on_image(
     size: tuple[int, int],
     optics: Optics,
     near: float = 0.0,
-) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-    """Places of world points, and which have one, by the rules at the head of this module.
+    start: Float[Tensor, "*#batch 1"] | float = 0.5,
+) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"], Float[Tensor, "*#batch 1"] | float]:
+    """Places of world points, which have one by the rules at the head of this module, and when.
 
     Args:
         world_to_camera, motion: as `Optics.middle` gives them. size: width and height, pixels.
+        start: time in [0, 1] from which the iteration for a rolling shutter starts.
+
+    Returns:
+        Pixels, with gradients; which points have a place; the time in [0, 1] at which each is seen
+        by a rolling shutter, without gradients. With a global shutter the time is `start`.
     """
     turned = points @ world_to_camera[:3, :3].mT
-    moved = turned + world_to_camera[:3, 3]
-    places, valid = image_points(moved, K, optics)
-    if motion is not None:
-        a, b, c = optics.row_time(*size)
-        for _ in range(SHUTTER_ITERATIONS):
-            time = (a * places[..., :1] + b * places[..., 1:] + c).clamp(0.0, 1.0) - 0.5
-            turn = axis_angle_to_matrices(time * motion[:3])
-            moved = (turn @ turned[..., None])[..., 0]
-            moved = moved + world_to_camera[:3, 3] + time * motion[3:]
-            places, valid = image_points(moved, K, optics)
-    return places, valid & (moved[..., 2] > near)
+    if motion is None:
+        moved = turned + world_to_camera[:3, 3]
+        places, valid = image_points(moved, K, optics)
+        return places, valid & (moved[..., 2] > near), start
+    *row, c = optics.row_time(*size)
+    down = points.new_tensor(row)[:, None]
+
+    def seen_at(time: Tensor, turned: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Places, which have one, their change with time, and the next time before its clamp."""
+        since = time - 0.5
+        turned = (axis_angle_to_matrices(since * motion[:3]) @ turned[..., None])[..., 0]
+        moved = turned + world_to_camera[:3, 3] + since * motion[3:]
+        velocity = torch.linalg.cross(motion[:3].expand_as(turned), turned) + motion[3:]
+        with forward_ad.dual_level():
+            places, valid = image_points(forward_ad.make_dual(moved, velocity), K, optics)
+            places, change = forward_ad.unpack_dual(places)
+        change = change.detach()
+        slope = 1.0 - change @ down
+        ahead = (places @ down + c - time) / torch.where(slope > 0, slope, 1.0)
+        return places, valid & (moved[..., 2] > near), change, time + ahead
+
+    # forward differentiation knows no inference mode
+    with torch.inference_mode(False):
+        with torch.no_grad():
+            rows = turned.reshape(-1, 3)
+            time = rows.new_empty(*turned.shape[:-1], 1).copy_(torch.as_tensor(start))
+            times, left = time.view(-1, 1), torch.arange(len(rows), device=rows.device)
+            for _ in range(SHUTTER_ITERATIONS):
+                before = times[left]
+                times[left] = after = seen_at(before, rows[left])[3].clamp(0.0, 1.0)
+                still = (after - before).abs() < SHUTTER_TOLERANCE * abs(down).max()
+                left = left[~still[:, 0]]
+                if not len(left):
+                    break
+            found = torch.ones_like(times[:, 0], dtype=torch.bool)
+            found[left] = False
+        places, valid, change, ahead = seen_at(time, turned)
+    ahead = torch.where((ahead >= 0) & (ahead <= 1), ahead - time, 0.0)
+    return places + change * ahead, valid & found.view_as(valid), time
 
 
 def unscented(
@@ -279,10 +324,12 @@ def unscented(
         axes: columns are the standard deviations along the axes, world, metres.
     """
     around = STEP * axes.mT
-    points = torch.cat((means[:, None], means[:, None] + around, means[:, None] - around), 1)
-    places, seen = world_points_on_image(points, world_to_camera, motion, K, size, optics, near)
-    plus, minus = (places[:, 1:] - places[:, :1]).split(3, 1)
+    points = means[:, None] + torch.cat((around, -around), 1)
+    camera = (world_to_camera, motion, K, size, optics, near)
+    centre, seen, time = world_points_on_image(means[:, None], *camera)
+    places, all_seen = world_points_on_image(points, *camera, time)[:2]
+    plus, minus = (places - centre).split(3, 1)
     first, second = (plus - minus) / (2 * STEP), (plus + minus) / (2 * STEP)
     shift = second.sum(1) / STEP
     root = torch.cat((first, second, math.sqrt(BEND) * shift[:, None]), 1).mT
-    return places[:, 0] + shift, root, seen.all(-1)
+    return centre[:, 0] + shift, root, seen[:, 0] & all_seen.all(-1)

@@ -164,7 +164,7 @@ class Camera:
         if self.optics is not None:
             pose, motion = self.optics.middle(self.world_to_camera)
             size = (self.width, self.height)
-            places, seen = world_points_on_image(points, pose, motion, self.K, size, self.optics)
+            places, seen, _ = world_points_on_image(points, pose, motion, self.K, size, self.optics)
             depth = points @ pose[2, :3] + pose[2, 3]
             return torch.where(seen[..., None], places, torch.nan), depth
         cam = self.to_camera(points)

@@ -18,6 +18,7 @@ from hoigs.core.values.camera import Camera
 
 # Undistortion: images, masks and depth of a lens with distortion, as a pinhole sees them.
 
+Margins = tuple[int, int, int, int]  # left, top, right, bottom; pixels
 FAR_OUTSIDE = -9.0  # in grid_sample's units, where the image spans -1..1
 
 
@@ -25,40 +26,43 @@ class Undistortion:
     """Maps a distorted image onto its pinhole camera.
 
     Args:
-        source: [H, W, 2] where each pinhole pixel lies in the distorted frame, pixels; NaN where
+        source: [Hp, Wp, 2] where each pinhole pixel lies in the distorted frame, pixels; NaN where
             the lens sees nothing there. None if the frame is a pinhole image already.
         forward: distorted pixels [N, 2] to pinhole pixels [N, 2]; None for the identity.
+        margins: pixels by which the pinhole image is larger, see `Lens.margins`.
 
     Attributes:
-        outside: [H, W] pinhole pixels that the frame does not show; None where it shows all.
+        outside: [Hp, Wp] pinhole pixels that the frame does not show; None where it shows all.
         shift: the farthest that a coordinate of a pixel is moved by, pixels.
     """
 
     def __init__(
         self,
-        source: Float[np.ndarray, "H W 2"] | None = None,
+        source: Float[np.ndarray, "Hp Wp 2"] | None = None,
         forward: Callable[[Any], Any] | None = None,
+        margins: Margins = (0, 0, 0, 0),
     ) -> None:
         self._forward = forward
         self._grid: Tensor | None = None
-        self.outside: Bool[np.ndarray, "H W"] | None = None
+        self.outside: Bool[np.ndarray, "Hp Wp"] | None = None
         self.shift = 0.0
         if source is not None:
-            height, width = source.shape[:2]
-            size = np.array([width, height])
-            y, x = np.mgrid[:height, :width] + 0.5
-            self.shift = float(np.nanmax(np.abs(source - np.stack((x, y), -1))))
+            left, top, right, bottom = margins
+            size = np.array([source.shape[1] - left - right, source.shape[0] - top - bottom])
+            y, x = np.mgrid[: size[1], : size[0]] + 0.5
+            within = source[top : top + size[1], left : left + size[0]]
+            self.shift = float(np.nanmax(np.abs(within - np.stack((x, y), -1))))
             with np.errstate(invalid="ignore"):
                 inside = np.all((source >= 0) & (source <= size), axis=-1)
             grid = np.where(np.isfinite(source), 2 * source / size - 1, FAR_OUTSIDE)
             self._grid = torch.from_numpy(grid.astype(np.float32))[None]
             self.outside = None if inside.all() else np.logical_not(inside)
 
-    def image(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    def image(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "Hp Wp 3"]:
         """Bilinear; pixels outside repeat the border."""
         if self._grid is None:
             return image
-        out = torch.empty(image.shape, dtype=torch.uint8)
+        out = torch.empty(*self._grid.shape[1:3], 3, dtype=torch.uint8)
         # a channel at a time: large temporary arrays would fragment the heap among cached frames
         for channel, values in enumerate(torch.from_numpy(image).unbind(-1)):
             moved = torch.nn.functional.grid_sample(
@@ -68,11 +72,11 @@ class Undistortion:
             out[..., channel] = moved[0, 0].round_()
         return out.numpy()
 
-    def mask(self, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    def mask(self, mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "Hp Wp"]:
         """The nearest pixel; False outside."""
         return self._nearest(mask.astype(np.float32)) > 0.5
 
-    def depth(self, depth: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    def depth(self, depth: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "Hp Wp"]:
         """The nearest pixel, for depths across an edge have no mean; 0 (unknown) outside."""
         return self._nearest(depth)
 
@@ -209,15 +213,33 @@ class Lens:
         scaled.rescale(width, height)
         return Lens(self.model, tuple(float(p) for p in scaled.params), width, height)
 
-    def undistortion(self, size: tuple[int, int] | None = None) -> Undistortion:
+    def undistortion(
+        self, size: tuple[int, int] | None = None, margins: Margins = (0, 0, 0, 0)
+    ) -> Undistortion:
         """From this lens's images to those of `camera`; made once for equal lenses.
 
         Args:
             size: width and height of the images, if they were resized.
+            margins: pixels by which those of `camera` are larger, as `margins` gives them.
         """
         if self.model in PINHOLES:  # captures with a focal length a frame stay cheap
             return Undistortion()
-        return _undistortion(self, size or (self.width, self.height))
+        return _undistortion(self, size or (self.width, self.height), margins)
+
+    def margins(self, size: tuple[int, int]) -> Margins:
+        """Pixels at each side by which the pinhole image has to be larger to show all that the
+        lens shows; at most half of its width or height.
+
+        Args:
+            size: width and height of the images.
+        """
+        # not of the border alone, which may be 90 degrees off the axis, and beyond
+        grid = np.stack(np.meshgrid(*(np.linspace(0, side, 201) for side in size)), -1)
+        places = self.undistortion(size).pixels(grid)
+        low, high = np.nanmin(places, (0, 1)), np.nanmax(places, (0, 1))
+        beyond = np.clip([*-low, *(high - size)], 0, 0.5 * np.array([*size, *size]))
+        left, top, right, bottom = np.ceil(beyond - 1e-3).astype(int).tolist()
+        return left, top, right, bottom
 
     @property
     def _colmap(self) -> Any:
@@ -244,12 +266,15 @@ class Lens:
 
 
 @functools.lru_cache(maxsize=8)  # rigs have a few lenses; a map of 1280x720 pixels takes 7 MiB
-def _undistortion(lens: Lens, size: tuple[int, int]) -> Undistortion:
+def _undistortion(lens: Lens, size: tuple[int, int], margins: Margins) -> Undistortion:
     colmap = lens._colmap
     scale = np.array(size) / (lens.width, lens.height)
     focal = np.array([colmap.focal_length_x, colmap.focal_length_y]) * scale
     center = np.array([colmap.principal_point_x, colmap.principal_point_y]) * scale
-    x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
+    left, top, right, bottom = margins
+    x, y = np.meshgrid(
+        np.arange(-left, size[0] + right) + 0.5, np.arange(-top, size[1] + bottom) + 0.5
+    )
     pinhole = np.stack((x, y), -1)
     flat = (pinhole.reshape(-1, 2) - center) / focal
 
@@ -270,8 +295,8 @@ def _undistortion(lens: Lens, size: tuple[int, int]) -> Undistortion:
         out = np.full_like(points, np.nan)
         if known.any():
             out[known] = np.asarray(colmap.cam_from_img(points[known] / scale))[:, :2]
-            out[known] = out[known] * focal + center
+            out[known] = out[known] * focal + center + (left, top)
         return out.reshape(xy.shape).astype(xy.dtype)
 
-    found = Undistortion(source, forward)
+    found = Undistortion(source, forward, margins)
     return found if found.shift >= NEGLIGIBLE_SHIFT else Undistortion()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hoigs.core.reporting import ranges
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.lens import Lens, Undistortion
+from hoigs.core.values.lens import Lens, Margins, Undistortion
 from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError, frame_number
 
@@ -28,11 +28,12 @@ class CameraTrack:
     """Pinhole cameras of all frames, and the mapping from the video's pixels to theirs.
 
     Attributes:
-        cameras: one a frame, at the width of the frames given out.
+        cameras: one a frame, at the size of the frames given out, and `margins` larger.
         points, colors: scene points in the cameras' own unit, RGB in [0, 1]; none if static.
         provenance: for the clip and the report.
         metric: whether the world is in metres already (a static camera has no scale of its own).
         lens: of the video; None if it is a pinhole's.
+        margins: pixels at each side by which the images of `cameras` are larger than the frames.
         model: folder of the COLMAP model, or None for a static camera.
         positions: places, among the frames given in, of those that have a camera.
         figures: for the report: "registered" and "images", "reprojection_px", "points",
@@ -49,13 +50,32 @@ class CameraTrack:
     model: Path | None = None
     positions: tuple[int, ...] = ()
     figures: dict[str, float] = field(default_factory=dict)
+    margins: Margins = (0, 0, 0, 0)
 
     @property
     def undistort(self) -> Undistortion:
         """From images, masks and pixel positions of the video to those of `cameras`."""
         if self.lens is None:
             return Undistortion()
-        return self.lens.undistortion((self.cameras[0].width, self.cameras[0].height))
+        left, top, right, bottom = self.margins
+        size = (self.cameras[0].width - left - right, self.cameras[0].height - top - bottom)
+        return self.lens.undistortion(size, self.margins)
+
+    def with_borders(self) -> CameraTrack:
+        """With images that are as much larger as `Lens.margins` says, and so lose no pixels."""
+        first = self.cameras[0]
+        size = (first.width, first.height)
+        margins = (0, 0, 0, 0) if self.lens is None else self.lens.margins(size)
+        if not any(margins):
+            return self
+        left, top, right, bottom = margins
+        width, height = first.width + left + right, first.height + top + bottom
+        return replace(
+            self,
+            cameras=[camera.cropped(-left, -top, width, height) for camera in self.cameras],
+            margins=margins,
+            provenance=f"{self.provenance}, onto {width}x{height} pixels",
+        )
 
     @property
     def static(self) -> bool:

@@ -34,6 +34,7 @@ def optics_scenes() -> dict[str, Scene]:
     camera = base.camera
     turn, shift = torch.tensor([0.03, -0.02, 0.05]), torch.tensor([0.1, 0.05, -0.05])
     last = camera.moved(turn, shift).world_to_camera
+    far = camera.moved(torch.tensor([-0.3, 0.1, 0.2]), torch.tensor([0.2, -0.4, 0.1]))
     flat = camera.K * torch.tensor([[0.3], [0.3], [1.0]])
     flat[:2, 2] = camera.K[:2, 2]
 
@@ -56,6 +57,8 @@ def optics_scenes() -> dict[str, Scene]:
                                last_world_to_camera=last), antialiased=True),
         "columns backwards": seen_by(replace(lens, shutter="right_to_left",
                                              last_world_to_camera=last)),
+        "rows in a fast turn": seen_by(replace(lens, shutter="top_to_bottom",
+                                               last_world_to_camera=far.world_to_camera)),
     }  # fmt: skip
 
 

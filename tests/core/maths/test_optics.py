@@ -20,6 +20,7 @@ from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.lens import Lens
 from hoigs.rasterizers.compositing import project_gaussians
+from hoigs.rasterizers.warp import WarpRasterizer
 
 K = torch.tensor([[55.0, 0.0, 30.0], [0.0, 50.0, 21.0], [0.0, 0.0, 1.0]]).double()
 WIDTH, HEIGHT = 64, 40
@@ -45,7 +46,13 @@ def pose(turn: tuple[float, ...], shift: tuple[float, ...]) -> Tensor:
 
 FIRST, LAST = pose((0.1, -0.2, 0.05), (0.1, -0.1, 3.0)), pose((0.16, -0.26, 0.0), (-0.1, 0.05, 3.2))
 ROLLING = Optics("fisheye", FISHEYE, shutter="top_to_bottom", last_world_to_camera=LAST)
-ALL = {**LENSES, "rolling": ROLLING}
+# up to 25 degrees and half a metre in a frame: some points move against the shutter, and faster
+FAST = Optics(
+    radial=(-0.2, 0.03),
+    shutter="top_to_bottom",
+    last_world_to_camera=pose((-0.3, -0.1, 0.2), (0.2, -0.5, 3.1)),
+)
+ALL = {**LENSES, "rolling": ROLLING, "fast": FAST}
 
 
 def a_camera(optics: Optics | None) -> Camera:
@@ -198,31 +205,66 @@ def test_small_gaussians_are_those_of_the_jacobian() -> None:
     torch.testing.assert_close(exact.opacities, ewa.opacities)
 
 
+@pytest.mark.parametrize("last", [LAST, FAST.last_world_to_camera], ids=["slow", "fast"])
 @pytest.mark.parametrize(
     "shutter", ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"]
 )
-def test_each_row_is_seen_from_the_pose_at_its_time(shutter: str) -> None:
-    optics = Optics(radial=(-0.2, 0.03), shutter=shutter, last_world_to_camera=LAST)
+def test_each_row_is_seen_from_the_pose_at_its_time(shutter: str, last: Tensor) -> None:
+    optics = Optics(radial=(-0.2, 0.03), shutter=shutter, last_world_to_camera=last)
     camera, points = a_camera(optics), a_cloud(40).means
     pixels, depths = camera.project(points)
+    with torch.inference_mode():
+        assert torch.equal(camera.project(points)[0], pixels)
     axis, size = (0, WIDTH) if "left" in shutter else (1, HEIGHT)
     time = ((pixels[:, axis] - 0.5) / (size - 1)).clamp(0, 1)
     if shutter in ("bottom_to_top", "right_to_left"):
         time = 1 - time
     assert time.std() > 0.1 and pixels.isfinite().all()
-    ends = [matrices_to_quats(view[:3, :3]) for view in (FIRST, LAST)]
+    ends = [matrices_to_quats(view[:3, :3]) for view in (FIRST, last)]
     still = replace(optics, shutter="global", last_world_to_camera=None)
     for point, pixel, depth, tau in zip(points, pixels, depths, time):
         for at, want in ((tau, pixel), (torch.tensor(0.5), None)):
             quat = slerp(*ends, at)
             view = torch.eye(4).double()
             view[:3, :3] = torch.stack([turned(quat, e) for e in torch.eye(3).double()], 1)
-            view[:3, 3] = (1 - at) * FIRST[:3, 3] + at * LAST[:3, 3]
+            view[:3, 3] = (1 - at) * FIRST[:3, 3] + at * last[:3, 3]
             found, z = replace(camera, world_to_camera=view, optics=still).project(point)
             if want is not None:
                 torch.testing.assert_close(found, want, atol=1e-7, rtol=0)
             else:
                 torch.testing.assert_close(z, depth, atol=2e-4, rtol=0)
+
+
+def test_a_point_that_moves_as_fast_as_the_shutter_has_no_place() -> None:
+    """The first point stays a row below the one that is exposed; the second one is far off."""
+    K = a_camera(None).K
+    z = 1.96 * K[1, 1] / (HEIGHT - 1)  # where 2 m are as many pixels as the shutter passes, and 2 %
+    y = (0.5 * HEIGHT + 0.8 - K[1, 2]) * z / K[1, 1] - 1.0
+    means = torch.stack((0 * z, y, z, 0.3 + 0 * z, 0 * z, 3 * z)).reshape(2, 3)
+    optics = Optics(
+        shutter="top_to_bottom", last_world_to_camera=pose((0.0, 0.0, 0.0), (0.0, 2.0, 0.0))
+    )
+    camera = Camera(K, torch.eye(4).double(), WIDTH, HEIGHT, optics)
+    assert camera.project(means)[0].isnan().all(-1).tolist() == [True, False]
+    cloud = Gaussians.from_points(means, scales=1e-3)
+    assert project_gaussians(cloud, camera, RenderRequest()).index.tolist() == [1]
+    drawn = WarpRasterizer().render(cloud.map(Tensor.float), camera.to(torch.float32))
+    assert (drawn.info["radii"] > 0).tolist() == [False, True]
+
+
+def test_points_at_a_phones_motion_take_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    last = pose((0.02, 0.02, 0.02), (0.01, 0.01, 2.01))  # 2 degrees and 2 cm
+    optics = replace(ROLLING, last_world_to_camera=last)
+    camera = replace(a_camera(optics), world_to_camera=pose((0.0, 0.0, 0.0), (0.0, 0.0, 2.0)))
+    looked_at, places = [], image_points
+
+    def counted(points: Tensor, *camera: object) -> tuple[Tensor, Tensor]:
+        looked_at.append(points[..., 0].numel())
+        return places(points, *camera)
+
+    monkeypatch.setattr("hoigs.core.maths.optics.image_points", counted)
+    assert camera.project(a_cloud(100).means)[0].isfinite().all()
+    assert sum(looked_at) <= 4 * 100  # three steps, and the place at the end
 
 
 def turned(quat: Tensor, vector: Tensor) -> Tensor:
@@ -253,7 +295,7 @@ def test_gradients_are_true(name: str) -> None:
     offsets = torch.zeros(4, 2).double()
     raw = (means, cloud.quats, cloud.log_scales, cloud.opacity_logits, offsets)
     leaves = [*raw, base.world_to_camera, base.K]
-    leaves += [LAST] if name == "rolling" else []
+    leaves += [base.optics.last_world_to_camera] if base.middle is not base else []
     leaves = [x.clone().requires_grad_() for x in leaves]
     assert torch.autograd.gradcheck(outputs, leaves, atol=1e-5, fast_mode=True)
 

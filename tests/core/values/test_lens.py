@@ -89,6 +89,31 @@ def test_positions_go_the_same_way() -> None:
     assert np.abs(back[:2] - want[:2]).max() < 1e-6 and np.isnan(back[2]).all()
 
 
+@pytest.mark.parametrize("distortion", [[-0.2, 0.03, 0.0, 0.01], [0.2, 0.0, 0.0, 0.0]])
+def test_an_image_with_margins_shows_all_of_the_frame(distortion: list[float]) -> None:
+    lens = Lens.opencv(K, distortion, *SIZE)
+    margins = lens.margins(SIZE)
+    assert any(margins) == (distortion[0] < 0)
+    left, top, right, bottom = margins
+    whole, plain = lens.undistortion(margins=margins), lens.undistortion()
+    large = np.array([SIZE[0] + left + right, SIZE[1] + top + bottom])
+    edges = np.array([[0, 0], [48, 0], [0, 40], [48, 40], [24, 0], [48, 20], [24, 40], [0, 20.0]])
+    places = whole.pixels(edges)
+    assert (places > -1e-3).all() and (places < large + 1e-3).all()
+    np.testing.assert_allclose(places, plain.pixels(edges) + np.array([left, top]), atol=1e-9)
+    frame = np.random.default_rng(0).integers(0, 255, (SIZE[1], SIZE[0], 3), np.uint8)
+    inner = slice(top, top + SIZE[1]), slice(left, left + SIZE[0])
+    assert whole.image(frame).shape == (large[1], large[0], 3)
+    assert (whole.image(frame)[inner] == plain.image(frame)).all() and whole.shift == plain.shift
+    assert whole.mask(frame[..., 0] > 99).shape == (large[1], large[0])
+
+
+def test_margins_are_at_most_half_of_the_frame() -> None:
+    fisheye = Lens("OPENCV_FISHEYE", (12.0, 12.0, 24.0, 20.0, 0.0, 0.0, 0.0, 0.0), *SIZE)
+    assert fisheye.margins(SIZE) == (24, 20, 24, 20)  # the corners are 150 degrees off the axis
+    assert Lens("PINHOLE", (12.0, 12.0, 24.0, 20.0), *SIZE).margins(SIZE) == (0, 0, 0, 0)
+
+
 def test_resized() -> None:
     half = Lens.opencv(K, [0.1, 0, 0, 0], *SIZE).resized(24, 20)
     assert torch.allclose(half.K[:2], torch.from_numpy(K[:2] / 2)) and half.params[4] == 0.1

@@ -12,7 +12,9 @@ take an array that `frame.camera_numbers` makes:
 Points are in float64 (`D`); what leaves these functions is float32. Of a point at rest,
 Y = R x, and X = Exp(time w) Y + t + time d with time = tau - 1/2. Where tau depends on the place p
 through p = P(X(tau)), tau = e.p + c, the implicit function theorem gives the adjoint: with
-m = dP/dX dX/dtau, the gradient v of p is v + e (m.v) / (1 - m.e) at fixed tau.
+m = dP/dX dX/dtau, the gradient v of p is v + e (m.v) / (1 - m.e) at fixed tau. A change of X at
+fixed tau changes tau by e.(dP/dX dX) / (1 - m.e), which tells where the iteration for the six other
+points starts. The last step of an iteration is added to the place as m times the step.
 """
 
 from hoigs.core.fast.launch import CPU_FLAGS
@@ -27,6 +29,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS
 
 D = wp.float64
 Places = wp.types.matrix(shape=(7, 2), dtype=wp.float64)
+Times = wp.types.vector(length=7, dtype=wp.float64)
 MODEL = wp.constant(9)
 RADIAL = wp.constant(10)
 TANGENTIAL = wp.constant(16)
@@ -41,6 +44,7 @@ STEP = wp.constant(wp.float64(rules.STEP))
 BEND = wp.constant(wp.float64(rules.BEND))
 SMALL_SLOPE = wp.constant(wp.float64(rules.SMALL_SLOPE))
 ITERATIONS = wp.constant(rules.SHUTTER_ITERATIONS)
+TOLERANCE = wp.constant(wp.float64(rules.SHUTTER_TOLERANCE))
 POSE_C = wp.constant(POSE)
 MOTION_C = wp.constant(MOTION)
 
@@ -63,7 +67,8 @@ class Seen:
     turned: wp.vec3d  # Exp(time w) Y
     z: wp.float64  # of X
     time: wp.float64
-    free: wp.float64  # 1 where the clamp lets the gradient through, else 0
+    m: wp.vec2d  # the place's change with time
+    gain: wp.float64  # 1 / (1 - m.e), or 0 where the clamp holds the time
 
 
 @wp.struct
@@ -80,6 +85,7 @@ class OpticsScreen:
     det: float
     nearest: float  # z of the nearest of the seven points; negative where one has no place
     places: Places  # of the mean, then those in the direction of each axis, then the opposite ones
+    times: Times  # at which each is seen
     shift: wp.vec2d
     raw_xx: wp.float64  # without the low-pass
     raw_xy: wp.float64
@@ -217,40 +223,57 @@ def motion_shift(K: F32) -> wp.vec3d:
 
 
 @wp.func
-def seen_at(rest: wp.vec3d, translation: wp.vec3d, K: F32) -> Seen:
+def row_time(K: F32) -> wp.vec2d:
+    """e"""
+    return wp.vec2d(number(K, ROW_TIME), number(K, ROW_TIME + 1))
+
+
+@wp.func
+def seen_at(rest: wp.vec3d, translation: wp.vec3d, start: wp.float64, K: F32) -> Seen:
+    """The place of a point Y; a rolling shutter's iteration begins at the time `start`."""
     seen = Seen()
     seen.turned = rest
-    seen.time = D(0.0)
-    seen.free = D(0.0)
+    seen.time = start
+    seen.gain = D(0.0)
     seen.z = rest[2] + translation[2]
-    seen.place = place_of(rest + translation, K)
-    if K[MOVES] != 0.0:
+    if K[MOVES] == 0.0:
+        seen.place = place_of(rest + translation, K)
+    else:
         turn = motion_turn(K)
         shift = motion_shift(K)
+        e = row_time(K)
+        within = TOLERANCE * (wp.abs(e[0]) + wp.abs(e[1]))
+        step = D(1.0)
         for _ in range(ITERATIONS):
-            tau = (
-                number(K, ROW_TIME) * seen.place.p[0]
-                + number(K, ROW_TIME + 1) * seen.place.p[1]
-                + number(K, ROW_TIME + 2)
-            )
-            within = wp.clamp(tau, D(0.0), D(1.0))
-            seen.free = wp.where(within == tau, D(1.0), D(0.0))
-            seen.time = within - D(0.5)
             seen.turned = turned_by(seen.time * turn, rest)
             point = seen.turned + translation + seen.time * shift
-            seen.z = point[2]
+            velocity = wp.cross(turn, seen.turned) + shift
             seen.place = place_of(point, K)
+            seen.m = wp.vec2d(wp.dot(seen.place.du, velocity), wp.dot(seen.place.dv, velocity))
+            slope = D(1.0) - wp.dot(seen.m, e)
+            seen.gain = D(1.0)
+            if slope > D(0.0):
+                seen.gain = D(1.0) / slope
+            shown = wp.dot(e, seen.place.p) + number(K, ROW_TIME + 2) - D(0.5)
+            wanted = seen.time + seen.gain * (shown - seen.time)
+            ahead = wp.clamp(wanted, D(-0.5), D(0.5))
+            if wanted != ahead:
+                seen.gain = D(0.0)
+            step = ahead - seen.time
+            seen.time = ahead
+            seen.place.p = seen.place.p + step * seen.m
+            seen.z = point[2] + step * velocity[2]
+            if wp.abs(step) < within:
+                break
+        if not (wp.abs(step) < within):
+            seen.place.valid = 0
     return seen
 
 
 @wp.func
 def at_fixed_time(seen: Seen, v: wp.vec2d, K: F32) -> wp.vec3d:
     """Gradient of X at fixed tau, given that of the place."""
-    if K[MOVES] != 0.0:
-        velocity = wp.cross(motion_turn(K), seen.turned) + motion_shift(K)
-        m = wp.vec2d(wp.dot(seen.place.du, velocity), wp.dot(seen.place.dv, velocity))
-        e = seen.free * wp.vec2d(number(K, ROW_TIME), number(K, ROW_TIME + 1))
-        v = v + (wp.dot(m, v) / (D(1.0) - wp.dot(m, e))) * e
+    v = v + (seen.gain * wp.dot(seen.m, v)) * row_time(K)
     return v[0] * seen.place.du + v[1] * seen.place.dv
 
 
@@ -325,8 +348,20 @@ def onto_screen(
     places = Places()
     nearest = rest[2] + translation[2]
     valid = wp.int32(1)
+    times = Times()
+    # six points start from the mean's time; a loop that carries it would not be vectorised
+    middle = D(0.0)
+    later = wp.vec3d(D(0.0), D(0.0), D(0.0))  # gradient of the mean's time by X
+    if K[MOVES] != 0.0:
+        center = seen_at(rest, translation, D(0.0), K)
+        e = center.gain * row_time(K)
+        later = e[0] * center.place.du + e[1] * center.place.dv
+        middle = center.time
     for i in range(7):
-        seen = seen_at(rest + offset_of(axes, i), translation, K)
+        from_mean = offset_of(axes, i)
+        start = wp.clamp(middle + wp.dot(later, from_mean), D(-0.5), D(0.5))
+        seen = seen_at(rest + from_mean, translation, start, K)
+        times[i] = seen.time
         places[i, 0] = seen.place.p[0]
         places[i, 1] = seen.place.p[1]
         nearest = wp.min(nearest, seen.z)
@@ -363,6 +398,7 @@ def onto_screen(
     if valid != 0:
         s.nearest = float(nearest)
     s.places = places
+    s.times = times
     s.shift = shift
     s.raw_xx = xx
     s.raw_xy = xy
@@ -416,7 +452,7 @@ def shape_adjoint(
     v_axes = wp.mat33d()
     turn = motion_turn(K)
     for i in range(7):
-        seen = seen_at(rest + offset_of(axes, i), translation, K)
+        seen = seen_at(rest + offset_of(axes, i), translation, s.times[i], K)
         v_point = at_fixed_time(seen, wp.vec2d(v_places[i, 0], v_places[i, 1]), K)
         v_translation += v_point
         v_drift += seen.time * v_point
