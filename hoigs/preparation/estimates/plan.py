@@ -178,7 +178,7 @@ def _frames(video: Path, options: PrepareOptions) -> int | None:
     if video.is_dir():
         count, rate = len(numbered_frames(video)), options.folder_fps
     else:
-        header = video_header(video)
+        header = video_header(video, about=True)
         if header is None:
             return None
         count, rate = header

@@ -47,8 +47,13 @@ def unreadable(path: Path, error: Exception) -> SourceError:
 MOST = 0.97  # of the header's frames, which are an estimate where it gives seconds only
 
 
-def video_header(path: Path) -> tuple[int, float] | None:
-    """Number of frames and frames a second, as the header has them; None if it has not."""
+def video_header(path: Path, about: bool = False) -> tuple[int, float] | None:
+    """Number of frames and frames a second, as the header has them; None if it has not.
+
+    Args:
+        about: where the header has the length of the whole file alone, as Matroska's and WebM's
+            have, take it for that of the video. Sound may be longer.
+    """
     av = pyav()
 
     try:
@@ -56,6 +61,8 @@ def video_header(path: Path) -> tuple[int, float] | None:
         with container:
             rate = float(stream.average_rate or 0)
             seconds = float((stream.duration or 0) * (stream.time_base or 0))
+            if about and not seconds:
+                seconds = (container.duration or 0) / av.time_base
             count = stream.frames or round(seconds * rate)
             return (count, rate) if count and rate else None
     except (av.error.FFmpegError, SourceError, ValueError):

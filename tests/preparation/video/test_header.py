@@ -39,6 +39,21 @@ def test_frames_that_an_edit_list_hides_are_not_missing(tmp_path: Path) -> None:
     assert len(missing_frames(path, 10)) == 1  # fewer than are shown: it is cut off
 
 
+def test_a_header_that_has_the_length_of_the_file_alone(tmp_path: Path) -> None:
+    """Matroska counts no frames: the plan's times were unknown."""
+    path = tmp_path / "video.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("h264", rate=25)
+        stream.width = stream.height = 64
+        for i in range(50):
+            image = np.full((64, 64, 3), 5 * i, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    assert video_header(path) is None and missing_frames(path, 1) == []
+    header = video_header(path, about=True)
+    assert header is not None and header[0] == pytest.approx(50, abs=2)
+
+
 def test_a_file_that_is_no_video_has_no_header(tmp_path: Path) -> None:
     path = tmp_path / "text.mp4"
     path.write_text("no video")
