@@ -77,6 +77,12 @@ class CameraTrack:
             provenance=f"{self.provenance}, onto {width}x{height} pixels",
         )
 
+    def without(self, frames: Sequence[int]) -> CameraTrack:
+        """Without the cameras of some frames, given by their places among those given in."""
+        kept = [k for k, place in enumerate(self.positions) if place not in frames]
+        cameras, positions = zip(*((self.cameras[k], self.positions[k]) for k in kept), strict=True)
+        return replace(self, cameras=[*cameras], positions=positions)
+
     @property
     def static(self) -> bool:
         """Whether it stays in one place, where it may turn."""

@@ -10,12 +10,17 @@ import pytest
 import torch
 from tiny import FRAMES, HEIGHT, WIDTH
 
+from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.camera_track import (
     colmap_cameras,
     parallax,
     pinhole,
     static_cameras,
 )
+from hoigs.preparation.cameras.choose import BesideVideo, ChosenCameras, choose_cameras
+from hoigs.preparation.estimates.reader import GivenMasks
+from hoigs.preparation.mask_stack import MaskStack
+from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.video.frames import Choice, VideoFrames
 from hoigs.preparation.video.source import SourceError
 
@@ -122,6 +127,35 @@ def test_static_camera(tiny_video: Path) -> None:
     given = static_cameras(video, pinhole(video, 120.0))
     assert float(given.cameras[0].K[1, 1]) == pytest.approx(60) and "given" in given.provenance
     assert parallax(given.cameras, torch.tensor([0.0, 0, 3])) == pytest.approx(0, abs=1e-3)
+
+
+def test_frames_in_which_a_hand_covers_the_lens_are_left_out(
+    tiny_video: Path, tmp_path: Path
+) -> None:
+    """Their masks covered four fifths of the image, and the body followed its neighbours there."""
+    video = VideoFrames(tiny_video)
+    seen = torch.ones(FRAMES, 33, 3)
+    seen[[0, 3, FRAMES - 1]] = torch.nan
+    masks = np.zeros((FRAMES, HEIGHT, WIDTH), bool)
+    masks[:, : HEIGHT // 3] = True
+    masks[[2, FRAMES - 1]] = True  # landmarks were found in the first of these
+    landmarks = Landmarks(seen, seen)
+
+    def chosen(masks: np.ndarray) -> ChosenCameras:
+        given = GivenMasks(human=MaskStack(masks))
+        options = PrepareOptions(camera="static")
+        return choose_cameras(
+            video, landmarks, given, BesideVideo(), options, tmp_path, lambda share: None
+        )
+
+    found = chosen(masks)
+    assert found.track.positions == tuple(range(FRAMES - 1))
+    assert len(found.track.cameras) == FRAMES - 1
+    assert any("left out" in text for text in found.warnings)
+    close_up = chosen(np.ones_like(masks))
+    assert len(close_up.track.positions) == FRAMES - 3, "three of twelve have no landmarks"
+    seen[: FRAMES // 2] = torch.nan
+    assert len(chosen(np.ones_like(masks)).track.positions) == FRAMES, "a close-up stays whole"
 
 
 def test_scaling_the_world_keeps_the_picture(tiny_video: Path, tmp_path: Path) -> None:
