@@ -3,24 +3,24 @@
 A richer model is ahead a little, or behind, on a scene that the simpler one describes completely.
 How much that is depends on the clip, its masks, the length of a trial and the renderer, so no
 number of dB can be right for long. Here it is measured: both are trained on what the trained
-simpler model draws, with that model's own errors under a random sign for every frame (the wild
-bootstrap, Wu 1986), and once more with the opposite signs, so that what the signs bring cancels
-(antithetic: Hammersley and Morton 1956). Frame by frame, the mean gain there is subtracted from the
-gain on the clip (Efron and Tibshirani 1993, An Introduction to the Bootstrap, chapter 16): a frame
-in which one of them is always better, as its knots happen to lie, tells nothing.
+simpler model draws, with the errors that the richer one leaves in the same frame (a parametric
+bootstrap with the residuals of the larger model, as for regressions in Davidson and MacKinnon 2004,
+Econometric Theory and Methods, chapter 4). These errors keep their place and sign, so that what no
+model can draw, such as detail beyond the renderer, is as it is in the video. Frame by frame, the
+gain there is subtracted from the gain on the clip: a frame in which one of them is always better,
+as its knots happen to lie, tells nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from statistics import mean
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.clip import Clip, Frame, FrameStore
 from hoigs.studies.needs.search_space import (
     SCORING,
     Gain,
@@ -60,29 +60,30 @@ class DrawnStore(FrameStore):
 
 
 @torch.no_grad()
-def as_if_true(trial: Trial, flip: bool = False, seed: int = 0) -> Clip:
-    """The view of a trial with images in which its model is the truth, where the trial is scored.
+def as_if_true(simple: Trial, rich: Trial) -> Clip:
+    """The clip of two trained trials as it would be if the simpler model were the truth.
 
-    Args:
-        trial: trained. flip: turns all signs of its errors. seed: of these signs.
+    Its images, where the trials are scored, are what the simpler model draws plus the errors that
+    the richer one leaves in the same frame.
     """
-    generator = torch.Generator().manual_seed(seed)
-    model, view = trial.model, trial.view
-    training = model.training
-    model.eval()
-    images = {}
+    view, images = simple.view, {}
     for position in sorted({p for split in view.split.values() for p in split}):
         frame = view[position]
-        where = region_of(frame, view, trial.region, trial.names)
-        output = model.render(frame.moment.to(model.device), frame.camera.to(model.device))
-        behind = (1 - output.alpha.cpu())[..., None] * frame.rgb
-        drawn = output.color.cpu() + behind
-        sign = 1.0 if (torch.rand((), generator=generator) < 0.5) != flip else -1.0
-        found = (drawn + sign * (frame.rgb - drawn)).clamp(0, 1)
+        where = region_of(frame, view, simple.region, simple.names)
+        found = (frame.rgb + _drawn(simple, frame) - _drawn(rich, frame)).clamp(0, 1)
         image = torch.where(where[..., None], found, frame.rgb)
         images[position] = (255 * image).round().to(torch.uint8)
-    model.train(training)
     return replace(view, store=DrawnStore(view.store, images))
+
+
+def _drawn(trial: Trial, frame: Frame) -> Float[Tensor, "H W 3"]:
+    """What a trial's model draws, before the frame itself."""
+    model = trial.model
+    training = model.training
+    model.eval()
+    output = model.render(frame.moment.to(model.device), frame.camera.to(model.device))
+    model.train(training)
+    return output.color.cpu() + (1 - output.alpha.cpu())[..., None] * frame.rgb
 
 
 @dataclass(frozen=True)
@@ -109,39 +110,44 @@ def calibrated(
     moves: bool = False,
     what: str = "",
 ) -> Calibrated:
-    """The cheapest candidate that the best is not ahead of by more than its freedom explains.
+    """The cheapest candidate that no finalist is ahead of by more than its freedom explains.
 
     Where the allowance does not reach for a calibration, a gain counts as it is.
 
     Args:
         trials: of each candidate, cheapest first. costs: of a step of each. halving: of the trials;
             scores of those that are trained on are added. steps: of the trials that reached its
-            end. allowance: entered before each training, as `what`. least: dB of gain that are
-            ignored in any case. moves: the clip's track says that the object moves; a model that
-            stands still contradicts it, and is taken only if it is as good.
+            end, the finalists. allowance: entered before each training, as `what`. least: dB of
+            gain that are ignored in any case. moves: the clip's track says that the object moves; a
+            model that stands still contradicts it, and is taken only if it is as good.
     """
     finalists = [k for k, scores in enumerate(halving.scores) if steps in scores]
-    best = max(finalists, key=lambda k: halving.scores[k][steps].mean)
+    finalists.sort(key=lambda k: halving.scores[k][steps].mean, reverse=True)
+    best = finalists[0]
     useless: dict[int, Gain] = {}
-    for k in range(best):
-        seen, own, top = halving.last_common(k, best)
+
+    def is_ahead(rich: int, simple: int) -> bool:
+        seen, own, top = halving.last_common(simple, rich)
         found, errors = gain(top, own), 1.0
         if found.mean - found.error > OBVIOUS:
-            continue
-        if moves and found.mean > least and _stands_still(trials[k]):
-            continue
+            return True
+        if moves and found.mean > least and _stands_still(trials[simple]):
+            return True
         scoring = SCORING * len(own.psnr)
-        pair = (costs[k] + costs[best]) * (steps + scoring)
-        price = costs[k] * (steps - seen + scoring) + 2 * pair
+        price = costs[simple] * (steps - seen + scoring)
+        price += (costs[simple] + costs[rich]) * (steps + scoring)
         if price <= allowance.left:
-            allowance.spend(f"{what}[{best}] where [{k}] is the truth", price)
-            own = halving.scores[k][steps] = trials[k].advance(steps)
-            null = _useless(trials[k], trials[best], steps)
-            useless[k] = mean_gain(null)
-            real = differences(halving.scores[best][steps], own)
-            found = mean_gain([gained - there for gained, there in zip(real, null, strict=True)])
+            allowance.spend(f"{what}[{rich}] where [{simple}] is the truth", price)
+            own = halving.scores[simple][steps] = trials[simple].advance(steps)
+            there = _useless(trials[simple], trials[rich], steps)
+            useless.setdefault(simple, mean_gain(there))
+            here = differences(halving.scores[rich][steps], own)
+            found = mean_gain([gained - null for gained, null in zip(here, there, strict=True)])
             errors = ERRORS
-        if found.mean <= max(errors * found.error, least):
+        return found.mean > max(errors * found.error, least)
+
+    for k in range(best):
+        if not any(is_ahead(rich, k) for rich in finalists if k < rich <= best):
             return Calibrated(k, useless)
     return Calibrated(best, useless)
 
@@ -152,9 +158,6 @@ def _stands_still(trial: Trial) -> bool:
 
 def _useless(simple: Trial, rich: Trial, steps: int) -> list[float]:
     """What the rich one gains in each frame where the simple one is the truth, dB."""
-    gains = []
-    for flip in (False, True):
-        view = as_if_true(simple, flip)
-        cheap, dear = (trial.on(view).advance(steps) for trial in (simple, rich))
-        gains.append(differences(dear, cheap))
-    return [mean(both) for both in zip(*gains, strict=True)]
+    view = as_if_true(simple, rich)
+    cheap, dear = (trial.on(view).advance(steps) for trial in (simple, rich))
+    return differences(dear, cheap)

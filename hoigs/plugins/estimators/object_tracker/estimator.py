@@ -38,7 +38,13 @@ from hoigs.plugins.estimators.object_tracker.scene import (
     moving_scene,
     static_scene,
 )
-from hoigs.plugins.estimators.object_tracker.states import mostly_doubtful, states_of
+from hoigs.plugins.estimators.object_tracker.states import (
+    DOUBTFUL,
+    SEEN,
+    is_worn,
+    mostly_doubtful,
+    states_of,
+)
 from hoigs.plugins.estimators.object_tracker.tracker import (
     Said,
     at_rest,
@@ -105,10 +111,14 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 20  # of what is kept in `work`; raised when masks change
+VERSION = 21  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
+)
+CLOTHES = (
+    "what was taken never leaves one person's torso and thighs and may be their clothes: no mask "
+    "of it counts as seen; click on the object"
 )
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
@@ -194,8 +204,12 @@ class ObjectTrackerEstimator(Estimator):
         tracks, alike = told_apart(footage, scene, prompts, tracks)
         vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
         tracks |= dict.fromkeys(vague)
-        notes += [*alike, *(f"{name}: {VAGUE}" for name in vague), *doubts(tracks, footage)]
-        write_tracks(file, video, footage, tracks, Said(chosen, notes, states_of(footage, tracks)))
+        states = states_of(footage, tracks)
+        worn = [n for n, t in tracks.items() if n in chosen and t and is_worn(t.soft > 127, people)]
+        states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in worn}
+        said = [f"{n}: {why}" for names, why in ((vague, VAGUE), (worn, CLOTHES)) for n in names]
+        notes += [*alike, *said, *doubts(tracks, footage)]
+        write_tracks(file, video, footage, tracks, Said(chosen, notes, states))
 
     def _prompted(
         self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]

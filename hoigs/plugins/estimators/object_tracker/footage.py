@@ -24,6 +24,7 @@ LIMBS = (
     ((27, 31), 0.20), ((28, 32), 0.20), ((0, 7), 0.40), ((0, 8), 0.40),
 )  # fmt: skip
 SHOULDERS, HIPS = (11, 12), (23, 24)
+TRUNK = tuple((ends, radius) for ends, radius in LIMBS if {*ends} <= {11, 12, 23, 24, 25, 26})
 # Pairs of landmarks between which the body itself is seen, if anything of it is: what lies farther
 # in front of the body than its limbs hides the middle of the torso first.
 BARE = (
@@ -74,14 +75,21 @@ def torso_length(landmarks: Float[np.ndarray, "F 33 4"]) -> Float[np.ndarray, "F
 
 
 def limbs(
-    shape: tuple[int, int], landmarks: Float[np.ndarray, "33 4"], torso: float
+    shape: tuple[int, int],
+    landmarks: Float[np.ndarray, "33 4"],
+    torso: float,
+    pairs: Sequence[tuple[tuple[int, int], float]] = LIMBS,
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Pixels that the body of one person may cover; None where their torso is not seen."""
+    """Pixels that the body of one person may cover; None where their torso is not seen.
+
+    Args:
+        torso: its length, pixels. pairs: the limbs, as in LIMBS; TRUNK has torso and thighs alone.
+    """
     if not (np.isfinite(torso) and (landmarks[[*SHOULDERS, *HIPS], 3] > SEEN).all()):
         return None
     y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
     found = _inside(x, y, landmarks[[11, 12, 24, 23], :2])
-    for (a, b), radius in LIMBS:
+    for (a, b), radius in pairs:
         # an end that is not seen is still where the limb would be: it is rather body than thing
         found |= _from_line(x, y, landmarks[a, :2], landmarks[b, :2]) < radius * torso
     return found

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.footage import (
+    TRUNK,
+    Footage,
+    limbs,
+    torso_length,
+)
 from hoigs.plugins.estimators.object_tracker.path import center_of
 from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, lies_on_people
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 
 SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a person"
 DOUBTFUL = "doubtful"  # there is a mask, and it may be a part of a person
+WORN, FEWEST = 0.9, 5  # share of a mask, and of the frames, that are clothes; frames that say so
 RIM = 2  # pixels from the edge of the picture within which a mask reaches it
 COVERED = 0.5  # share of its place from which something hides it
 SAME_PLACE = 1.5  # breadths between the sightings around a gap, up to which it stayed about there
@@ -52,6 +58,26 @@ def mostly_doubtful(states: Sequence[str]) -> bool:
     and a training with them would learn that."""
     doubtful, seen = (states.count(state) for state in (DOUBTFUL, SEEN))
     return doubtful > seen
+
+
+def is_worn(
+    masks: Bool[np.ndarray, "F h w"], people: Sequence[Float[np.ndarray, "F 33 4"]]
+) -> bool:
+    """Whether an object never leaves the torso and thighs of one person: rather their clothes.
+
+    Frames in which the person's torso is not seen say nothing.
+
+    Args:
+        masks: of the object. people: landmarks of each person, pixels and visibility.
+    """
+    for landmarks in people:
+        torso, within = torso_length(landmarks), []
+        for i in np.flatnonzero(masks.any((1, 2))):
+            trunk = limbs(masks.shape[1:], landmarks[i], torso[i], TRUNK)
+            within += [] if trunk is None else [trunk[masks[i]].mean() > WORN]
+        if len(within) >= FEWEST and np.mean(within) > WORN:
+            return True
+    return False
 
 
 def _at_edge(mask: Bool[np.ndarray, "h w"]) -> bool:

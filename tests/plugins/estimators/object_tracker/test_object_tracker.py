@@ -152,11 +152,16 @@ def with_hands_before_the_belly(video: VideoRequest) -> VideoRequest:
 @pytest.mark.parametrize("flag", [False, True])
 def test_a_thing_before_the_body_is_proposed_by_its_colours(tmp_path: Path, flag: bool) -> None:
     """It lies within the person's mask and within their limbs, and was no candidate. What waves
-    far from the hands is not it."""
+    far from the hands is not it. As clothes would, it never leaves the torso, so that no mask of it
+    counts as seen; masks of a click do."""
     scene = before_the_body(flag)
     found = masks_of(with_hands_before_the_belly(request(tmp_path, scene)))
     on_thing(found, scene[2])
     assert overlaps(found, scene[2]).mean() > 0.75
+    assert {*found.states["object"]} == {"doubtful"}
+    box = FramePrompt(0, box=(42.0, 39.0, 58.0, 51.0))
+    clicked = masks_of(with_hands_before_the_belly(request(tmp_path, scene, (box,))))
+    assert clicked.states["object"].count("seen") > 0.7 * COUNT
 
 
 def test_a_thing_that_the_body_hides_is_proposed_before_and_after(tmp_path: Path) -> None:
