@@ -112,6 +112,10 @@ VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
 )
+EQUAL = (
+    "other things look the same, so that only its way tells which is which; where it does not, "
+    "nothing is shown, and a click there or later says it"
+)
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 
@@ -192,6 +196,7 @@ class ObjectTrackerEstimator(Estimator):
             share = 0.65 * len(group) / len(wanted)
             part = _part(progress, done, share)
             tracks |= followed_together(footage, {n: prompts[n] for n in group}, frame, part)
+            notes.append(f"{', '.join(group)}: {EQUAL}")
             done += share
         for entity in (e for e in wanted if e.name not in equal):
             if not entity.prompts:

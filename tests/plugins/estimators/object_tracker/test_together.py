@@ -45,12 +45,16 @@ def test_a_known_place_stays_first_and_one_object_has_one_place() -> None:
     assert places_of(odds_of(NOBODY), NOBODY, shape, [], 4) == []
 
 
-def ways_through(frames: list[list[tuple[float, float]]], hidden: bool = False) -> Way:
+def ways_through(
+    frames: list[list[tuple[float, float]]],
+    hidden: bool = False,
+    given: dict[int, dict[int, int]] | None = None,
+) -> Way:
     """The cheapest way of two objects of breadth 10 from the places of a first frame."""
     views = [
         View(
             i, np.array(places, float).reshape(-1, 2), np.full(len(places), 0.8),
-            np.zeros(len(places), bool), {}, lambda to: hidden,
+            np.zeros(len(places), bool), (given or {}).get(i, {}), lambda to: hidden,
         )
         for i, places in enumerate(frames)
     ]  # fmt: skip
@@ -73,6 +77,10 @@ def test_after_both_were_hidden_in_one_place_it_is_not_sure_which_is_which() -> 
     way = ways_through(met + apart, hidden=True)
     assert np.isfinite(way.trail[:, -1]).all()
     assert (way.margin[:, -3:] < CLEAR).all() and (way.margin[:, 1] > CLEAR).all()
+    for clicked in (0, 1):  # in the last frame, which says it of those before as well
+        way = ways_through(met + apart, hidden=True, given={10: {0: clicked}})
+        assert np.allclose(way.trail[0, -1], apart[-1][clicked])
+        assert (way.margin[:, -3:] > CLEAR).all()
 
 
 def test_an_object_that_another_passes_is_where_it_was() -> None:
