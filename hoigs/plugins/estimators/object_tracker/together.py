@@ -63,7 +63,6 @@ STRANGE = 4.0  # cost of a place that is none of the objects, if nothing else co
 KEPT, BEYOND = 40, 10.0  # joint ways that are kept, and how much more than the best they may cost
 SAME = 0.5  # breadths within which two ways have an object in one place
 RESTS, AS_BEFORE = 0.7, 6.0  # share of a place that looks as before, within so many units of colour
-ARRIVED = 4.0  # cost of having come to a place that looks as before
 CLEAR = 2.0  # what other ways cost more, from which a frame is sure
 
 
@@ -169,7 +168,8 @@ class Way:
         away = _beside(off, age * speed)
         doubt = age + self.before[k] - 1
         cost = np.minimum(0.5 * (away / self.steady) ** 2 / doubt, FAR + 0.2 * away / self.breadth)
-        cost += ARRIVED * (view.rests & (np.hypot(*off.T) > SAME * self.breadth))
+        if k not in view.given:  # nothing came to a place that looks as before
+            cost[view.rests & (np.hypot(*off.T) > SAME * self.breadth)] = np.inf
         now = self.at[k] + age * speed
         beside = np.hypot(*(view.places - now).T).min(initial=np.inf)
         hidden = age > 2 or view.covers(now) or beside < BEHIND * self.breadth
@@ -213,7 +213,7 @@ def cheapest(start: Way, views: Sequence[View]) -> Way:
 # Masks at the places of the cheapest way.
 
 WHOLE = 0.4  # share of a place in the clicked frame from which it is an object, too
-MORE = 3  # places that are looked for beyond those that were clicked
+MORE = 12  # places that are looked for beyond those that were clicked
 RIM = 0.15  # breadths beyond its shape that may be an object's
 LEAST = 0.3  # of the clicked area: a smaller mask is none
 OVER = 0.02  # of it: shapes that have less in common do not hide each other
