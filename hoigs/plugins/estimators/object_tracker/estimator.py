@@ -45,11 +45,13 @@ from hoigs.plugins.estimators.object_tracker.states import (
     mostly_doubtful,
     states_of,
 )
+from hoigs.plugins.estimators.object_tracker.together import followed_together, groups_of
 from hoigs.plugins.estimators.object_tracker.tracker import (
     Said,
     at_rest,
     color_model,
     followed,
+    learnt,
     read_tracks,
     write_tracks,
 )
@@ -111,7 +113,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 21  # of what is kept in `work`; raised when masks change
+VERSION = 22  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -119,6 +121,10 @@ VAGUE = (
 CLOTHES = (
     "what was taken never leaves one person's torso and thighs and may be their clothes: no mask "
     "of it counts as seen; click on the object"
+)
+EQUAL = (
+    "other things look the same, so that only its way tells which is which; where it does not, "
+    "nothing is shown, and a click there or later says it"
 )
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
@@ -190,18 +196,31 @@ class ObjectTrackerEstimator(Estimator):
         prompts: dict[str, list[PromptedMask]] = {}
         notes: list[str] = []
         chosen: dict[str, list[FramePrompt]] = {}
-        for k, entity in enumerate(wanted):
-            start, share = 0.35 + 0.65 * k / len(wanted), 0.65 / len(wanted)
-            if entity.prompts:
-                masks = self._prompted(entity, footage, scene, notes)
-            else:
-                masks, chosen[entity.name] = _proposed(
+        for entity in (e for e in wanted if e.prompts):
+            prompts[entity.name] = self._prompted(entity, footage, scene, notes)
+        known = {n: learnt(footage, masks) for n, masks in prompts.items() if masks}
+        groups = groups_of(prompts, {n: k for n, (_, k) in known.items()})
+        equal = {n for _, group in groups for n in group}
+        done = 0.35
+        for frame, group in groups:
+            share = 0.65 * len(group) / len(wanted)
+            part = _part(progress, done, share)
+            tracks |= followed_together(footage, {n: prompts[n] for n in group}, frame, part)
+            notes.append(f"{', '.join(group)}: {EQUAL}")
+            done += share
+        for entity in (e for e in wanted if e.name not in equal):
+            if not entity.prompts:
+                prompts[entity.name], chosen[entity.name] = _proposed(
                     entity, footage, scene, people, tracks, notes
                 )
-            prompts[entity.name] = masks
-            part = _part(progress, start, share)
-            tracks[entity.name] = followed(footage, scene, masks, part) if masks else None
-        tracks, alike = told_apart(footage, scene, prompts, tracks)
+            masks, share = prompts[entity.name], 0.65 / len(wanted)
+            part = _part(progress, done, share)
+            tracks[entity.name] = (
+                followed(footage, scene, masks, part, known.get(entity.name)) if masks else None
+            )
+            done += share
+        others = {n: [] if n in equal else masks for n, masks in prompts.items()}
+        tracks, alike = told_apart(footage, scene, others, {e.name: tracks[e.name] for e in wanted})
         vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
         tracks |= dict.fromkeys(vague)
         states = states_of(footage, tracks)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -89,6 +89,7 @@ def followed(
     scene: Scene,
     prompts: Sequence[PromptedMask],
     progress: Callable[[float], None] = lambda share: None,
+    known_by: tuple[Appearance, Known] | None = None,
 ) -> Track:
     """Masks of the frames that are proven to show the object; those of the others are empty.
 
@@ -97,15 +98,18 @@ def followed(
 
     Of equal things a user who marked one means that one, and one break in its way ends what is
     known of it. Of what was only proposed any is as good: white shoes do not end the way of a ball.
+
+    Args:
+        known_by: what `learnt` says of the prompts; None: not yet.
     """
-    looks, known = _learnt(footage, prompts)
+    looks, known = known_by or learnt(footage, prompts)
     first = tracked(footage, scene, prompts, looks=looks, progress=lambda x: progress(0.4 * x))
     proof = proof_of(footage, scene, prompts, first, looks, known)
     found = without_unproven(first, proof)
     best = anchors(footage, found, prompts)
     enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
     if best and not enough and not known.twins:  # which no looks tell apart
-        looks, known = _learnt(footage, [*prompts, *best])
+        looks, known = learnt(footage, [*prompts, *best])
         again = tracked(
             footage, scene, prompts, best, looks, lambda x: progress(0.4 + 0.3 * x)
         )  # fmt: skip
@@ -139,7 +143,7 @@ def _mended(found: Track, better: Track) -> Track:
     )
 
 
-def _learnt(footage: Footage, known: Sequence[PromptedMask]) -> tuple[Appearance, Known]:
+def learnt(footage: Footage, known: Sequence[PromptedMask]) -> tuple[Appearance, Known]:
     """What the object looks like in known frames, and these without others that look like it."""
     masks = {p.frame: p.soft > 0.5 for p in known}
     looks = Appearance.learnt(footage, masks)
@@ -167,7 +171,7 @@ def tracked(
     moving = isinstance(scene, MovingScene)
     # what rests is a part of a still camera's scene; a moving one's is that of nearby frames
     used = scene if moving or not rests else None
-    evidence = Evidence(footage, used, colors, looks or _learnt(footage, prompts)[0])
+    evidence = Evidence(footage, used, colors, looks or learnt(footage, prompts)[0])
     path = found_path(evidence, known, progress=lambda x: progress(0.3 * x))
     stands = not rests and stands_out(footage, used, path, known)
     unchanged = 1.2 if stands else 0.1
@@ -256,13 +260,18 @@ def stands_out(
     return bool(np.nanpercentile([*middle, np.nan, 99.0], 15) > 3)
 
 
-def color_model(footage: Footage, masks: dict[int, Float[np.ndarray, "h w"]]) -> ColorModel:
-    """Colours of the object in the given frames, and of all else in these and in others."""
+def color_model(
+    footage: Footage,
+    masks: Mapping[int, Float[np.ndarray, "h w"]],
+    twins: Mapping[int, Bool[np.ndarray, "h w"]] | None = None,
+) -> ColorModel:
+    """Colours of the object in the given frames, and of all else in them but its `twins`."""
     inside, outside = [], []
     for i, soft in masks.items():
         bins = bins_of(footage.colors(i))
         inside.append(histogram(bins, np.where(soft > 0.5, soft, 0)))
-        outside.append(histogram(bins, (soft < 0.3) * 1.0))
+        rest = (soft < 0.3) & ~np.asarray((twins or {}).get(i, False))
+        outside.append(histogram(bins, rest * 1.0))
     return ColorModel(np.mean(inside, 0), np.mean(outside, 0))
 
 

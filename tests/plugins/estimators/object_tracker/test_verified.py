@@ -27,7 +27,7 @@ from hoigs.plugins.estimators.object_tracker.states import (
     SEEN,
     states_of,
 )
-from hoigs.plugins.estimators.object_tracker.tracker import _learnt
+from hoigs.plugins.estimators.object_tracker.tracker import learnt
 from hoigs.plugins.estimators.object_tracker.verified import (
     Known,
     _continued,
@@ -127,8 +127,8 @@ def test_twins_count_only_for_what_somebody_marked() -> None:
     image[mask | other] = 250, 250, 250
     footage = footage_of([image] * 3, [nobody] * 3)
     marked = PromptedMask(0, mask.astype(np.float32), 1.0, False, nobody)
-    assert _learnt(footage, [marked])[1].twins
-    assert not _learnt(footage, [replace(marked, proposed=True)])[1].twins
+    assert learnt(footage, [marked])[1].twins
+    assert not learnt(footage, [replace(marked, proposed=True)])[1].twins
 
 
 def thrown() -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
