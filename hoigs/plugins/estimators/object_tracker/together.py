@@ -64,6 +64,7 @@ KEPT, BEYOND = 40, 10.0  # joint ways that are kept, and how much more than the 
 SAME = 0.5  # breadths within which two ways have an object in one place
 RESTS, AS_BEFORE = 0.7, 6.0  # share of a place that looks as before, within so many units of colour
 CLEAR = 2.0  # what other ways cost more, from which a frame is sure
+LONG = 12  # frames in a row that are not sure, after which an object's way says nothing any more
 
 
 @dataclass(frozen=True)
@@ -210,6 +211,17 @@ def cheapest(start: Way, views: Sequence[View]) -> Way:
     return best
 
 
+def lasting(sure: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " F"]:
+    """Frames in which it is sure where an object is, up to the first LONG in a row in which it is
+    not: an object that was not seen for so long may have been put down anywhere."""
+    run = 0
+    for i, seen in enumerate(sure):
+        run = 0 if seen else run + 1
+        if run == LONG:
+            return sure & (np.arange(len(sure)) < i)
+    return sure
+
+
 # Masks at the places of the cheapest way.
 
 WHOLE = 0.4  # share of a place in the clicked frame from which it is an object, too
@@ -257,11 +269,16 @@ def followed_together(
         after, before = cheapest(start, forth), cheapest(start, back)
         start = replace(start, steady=steadiness((after, before)))
     tracks = {n: Track(np.zeros(footage.lab.shape[:3], np.uint8), np.zeros(count)) for n in prompts}
+    sure = np.array([np.isfinite(w.trail).all(2) & (w.margin > CLEAR) for w in (before, after)])
+    sure = np.where(np.arange(count) < first, *sure)
+    for row, found in zip(sure, prompts.values()):
+        last, once = max(p.frame for p in found), min(p.frame for p in found)
+        row[last:], row[once::-1] = lasting(row[last:]), lasting(row[once::-1])
     for i in range(count):
         way = after if i >= first else before
         drawn = _masks(evidence, shape, i, places[i], way.trail[:, i])
         for k, (name, track) in enumerate(tracks.items()):
-            if k in drawn and way.margin[k, i] > CLEAR:
+            if k in drawn and sure[k, i]:
                 track.soft[i], track.confidence[i] = drawn[k]
             for p in (p for p in prompts[name] if p.frame == i):
                 track.soft[i], track.confidence[i] = np.rint(p.soft * 255), 1.0

@@ -12,7 +12,15 @@ from disc_world import COUNT, RADIUS, H, W, masks_of, request, texture
 from hoigs.core.interfaces.estimator import EntityRequest, FramePrompt, PromptPoint
 from hoigs.plugins.estimators.object_tracker.places import Shape, places_of
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
-from hoigs.plugins.estimators.object_tracker.together import CLEAR, View, Way, cheapest, groups_of
+from hoigs.plugins.estimators.object_tracker.together import (
+    CLEAR,
+    LONG,
+    View,
+    Way,
+    cheapest,
+    groups_of,
+    lasting,
+)
 from hoigs.plugins.estimators.object_tracker.verified import Known
 
 Y, X = np.mgrid[:H, :W] + 0.5
@@ -140,3 +148,11 @@ def test_two_equal_discs_that_cross_keep_their_names(tmp_path: Path) -> None:
         share = np.array([(m & t).sum() / max((m | t).sum(), 1) for m, t in zip(masks, true)])
         assert not any(m.any() and (m & t).sum() < 0.5 * m.sum() for m, t in zip(masks, true))
         assert (share > 0.6).mean() > 0.8, share
+
+
+def test_an_object_that_was_not_seen_for_long_may_be_anywhere() -> None:
+    sure = np.ones(40, bool)
+    sure[5 : 5 + LONG - 1] = False
+    assert np.array_equal(lasting(sure), sure)
+    sure[5 : 5 + LONG] = False
+    assert np.array_equal(np.flatnonzero(lasting(sure)), np.arange(5))
