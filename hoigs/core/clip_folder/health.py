@@ -75,6 +75,7 @@ def _fault(who: str, what: str, place: Float[Tensor, " 3"]) -> Diagnostic:
 
 MOST_FRAMES = 600  # examined in long clips, evenly spaced: each takes milliseconds to decode
 DEPTH_FRAMES, DEPTH_POINTS = 12, 20_000
+NO_GAP = 1.1  # times as far, up to which what moves speaks against a gap
 STEADY = 12  # median deviations of a track's steps beyond which it shows a gap by itself
 LEAST_AREA = 200  # pixels of a mask: a smaller one is mostly edge, whether it is ragged or not
 LEAST_POSES = 12  # of fewer, a fast motion cannot be told from noise
@@ -286,7 +287,8 @@ def _gaps(clip: Clip) -> Iterator[Diagnostic]:
 
 def _standing_out(path: Float[Tensor, "F D"]) -> Int[Tensor, " S"]:
     """Votes of one track for a gap at each step: 1 where it goes much further than in the steps
-    about it, 2 where it does so though it is steady everywhere else.
+    about it, 2 where it does so though it is steady everywhere else, and -1 where it moves and goes
+    no further than there, as nothing that moves does across a gap.
 
     Much further than the second largest of the four about it: not than the largest, so that two
     gaps close together do not hide each other; not than the middle one, so that a start from rest
@@ -301,4 +303,5 @@ def _standing_out(path: Float[Tensor, "F D"]) -> Int[Tensor, " S"]:
     logs = (steps / second.clamp_min(0.2 * float(steps.median()))).clamp_min(1e-6).log()
     spread = max(float((logs - logs.median()).abs().median()), 0.01)
     out = logs > math.log(GAP)
-    return out.long() + (out & (logs > STEADY * spread)).long()
+    against = (second > 0.5 * steps.median()) & (logs < math.log(NO_GAP))
+    return out.long() + (out & (logs > STEADY * spread)).long() - against.long()

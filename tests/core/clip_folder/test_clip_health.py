@@ -237,6 +237,14 @@ def test_a_start_from_rest_is_no_gap(clip: Clip) -> None:
     assert kinds(clip) == []
 
 
+def test_what_moves_on_evenly_speaks_against_a_gap() -> None:
+    """Cups of a shell game set off together while the hands go on."""
+    even = torch.linspace(0, 1, FRAMES)[:, None]
+    jumping = even + 0.1 * (torch.arange(FRAMES)[:, None] > 7)
+    votes = [int(health._standing_out(path)[7]) for path in (jumping, even, 0 * even)]
+    assert votes == [2, -1, 0]
+
+
 def test_an_unsteady_hand_is_no_gap(clip: Clip) -> None:
     generator = torch.Generator().manual_seed(2)
     cameras = []
