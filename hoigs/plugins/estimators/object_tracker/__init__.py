@@ -9,5 +9,5 @@ Entry point: `estimator`. In the order in which they work:
   again by what is `behind` it, or from `anchors`, frames in which it was found best.
 - `verified`: the masks that are proven. `states`: where the object is in the other frames.
 - `alike`: objects of which two tracks claim the same pixels. `together`: objects that look the same
-  where they were clicked, all in one search for joint ways through the `places` of each frame.
+  where they were clicked, all in one search for joint paths through the `places` of each frame.
 """

@@ -123,7 +123,7 @@ CLOTHES = (
     "of it counts as seen; click on the object"
 )
 EQUAL = (
-    "other things look the same, so that only its way tells which is which; where it does not, "
+    "other things look the same, so that only its path tells which is which; where it does not, "
     "nothing is shown, and a click there or later says it"
 )
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene

@@ -1,10 +1,10 @@
 """Equal objects that were clicked, followed together: what one of them is, no other can be.
 
 Looks do not tell equal objects apart. A frame says only where such objects are, and each place is
-taken by one of them at most; which is which follows from their ways. Of all joint ways the cheapest
-is found by a search that keeps the best few (multiple hypotheses, Reid 1979), and what other ways
-cost more says how sure each frame is (soft-output Viterbi, Hagenauer and Hoeher 1989): after a
-crossing that several ways explain, it is not known any more which is which.
+taken by one of them at most; which is which follows from their paths. Of all joint paths, the
+hypotheses, the cheapest is found by a search that keeps the best few (multiple hypothesis tracking,
+Reid 1979), and what others cost more says how sure each frame is (soft-output Viterbi, Hagenauer
+and Hoeher 1989): after a crossing that several hypotheses explain, it is not known which is which.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def groups_of(
     return groups
 
 
-# Joint ways through the places of all frames.
+# Joint paths through the places of all frames.
 
 STEADY = (0.1, 0.3)  # breadths a frame by which motions change: least and, at first, most
 MOVES = 0.05  # breadths a frame from which an object moves
@@ -60,16 +60,16 @@ FAR = 8.0  # cost of a place that cannot be reached
 COVERED, GONE = 1.0, 3.0  # cost of a frame without it; of the first two, if nothing hides it
 BEHIND, ON_PERSON = 0.8, 0.3  # breadths from another object, and share of people, that hide one
 STRANGE = 4.0  # cost of a place that is none of the objects, if nothing else covers it
-KEPT, BEYOND = 40, 10.0  # joint ways that are kept, and how much more than the best they may cost
-SAME = 0.5  # breadths within which two ways have an object in one place
+KEPT, BEYOND = 40, 10.0  # hypotheses that are kept; what they may cost more than the best
+SAME = 0.5  # breadths within which two hypotheses have an object in one place
 RESTS, AS_BEFORE = 0.7, 6.0  # share of a place that looks as before, within so many units of colour
-CLEAR = 2.0  # what other ways cost more, from which a frame is sure
-LONG = 12  # frames in a row that are not sure, after which an object's way says nothing any more
+CLEAR = 2.0  # what other hypotheses cost more, from which a frame is sure
+LONG = 12  # frames in a row that are not sure, after which an object's path ends
 
 
 @dataclass(frozen=True)
 class View:
-    """What the joint ways need of a frame.
+    """What the hypotheses need of a frame.
 
     Attributes:
         places: middles x, y. new: the share of each that no other covers. rests: whether it looks
@@ -86,15 +86,15 @@ class View:
 
 
 @dataclass(frozen=True)
-class Way:
-    """One joint way of N objects through the frames so far.
+class Hypothesis:
+    """One joint path of N objects through the frames so far.
 
     Attributes:
         breadth: of an object, pixels. steady: pixels a frame by which motions change.
         at, speed, age: of each object where it was last seen, its step there, and the frames since.
         before: frames that its step there took, of which the more the less sure it is.
-        trail: places x, y of all F frames, NaN where hidden. margin: what the cheapest other way
-            that has the object elsewhere in a frame costs more.
+        trail: places x, y of all F frames, NaN where hidden. margin: what the cheapest other
+            hypothesis that has the object elsewhere in a frame costs more.
     """
 
     cost: float
@@ -108,23 +108,25 @@ class Way:
     margin: Float[np.ndarray, "N F"]
 
     @classmethod
-    def starting(cls, breadth: float, at: Float[np.ndarray, "N 2"], frame: int, count: int) -> Way:
-        """The way that begins in a frame, of `count` in all, in which all places are known."""
+    def starting(
+        cls, breadth: float, at: Float[np.ndarray, "N 2"], frame: int, count: int
+    ) -> Hypothesis:
+        """The hypothesis that begins in one of `count` frames, in which all places are known."""
         n = len(at)
         trail, margin = np.full((n, count, 2), np.nan), np.full((n, count), np.inf)
         trail[:, frame] = at
         once, rest = (1,) * n, np.zeros_like(at)
         return cls(0.0, breadth, STEADY[1] * breadth, at, rest, once, once, trail, margin)
 
-    def merged(self, other: Way) -> Way:
-        """This way, with another that costs more and is not followed any further."""
+    def merged(self, other: Hypothesis) -> Hypothesis:
+        """This hypothesis, with another that costs more and is not followed any further."""
         a, b = (np.nan_to_num(w.trail, nan=-1e4) for w in (self, other))
         apart = np.hypot(*np.moveaxis(a - b, -1, 0)) > SAME * self.breadth
         more = other.cost - self.cost + np.where(apart, 0.0, other.margin)
         return replace(self, margin=np.minimum(self.margin, more))
 
-    def onwards(self, view: View) -> list[tuple[tuple, Way]]:
-        """The ways that continue it in a frame, and by what those that end alike are known."""
+    def continued(self, view: View) -> list[tuple[tuple, Hypothesis]]:
+        """The hypotheses that continue it in a frame, and the key of those that end alike."""
         choices: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
         taken = set(view.given.values())
         for k in range(len(self.at)):
@@ -145,11 +147,11 @@ class Way:
         found = []
         for k in np.flatnonzero(cost < cost.min() + BEYOND).tolist():
             chosen = choices[k][1]
-            way = self._moved(view, chosen, float(cost[k]))
-            found.append(((chosen, tuple(way.at[np.less(chosen, 0)].ravel())), way))
+            path = self._moved(view, chosen, float(cost[k]))
+            found.append(((chosen, tuple(path.at[np.less(chosen, 0)].ravel())), path))
         return found
 
-    def _moved(self, view: View, chosen: Sequence[int], cost: float) -> Way:
+    def _moved(self, view: View, chosen: Sequence[int], cost: float) -> Hypothesis:
         """Each object at the place chosen for it; -1: it is hidden."""
         at, speed, trail = self.at.copy(), self.speed.copy(), self.trail.copy()
         for k, p in enumerate(chosen):
@@ -178,36 +180,40 @@ class Way:
 
 
 def _beside(
-    off: Float[np.ndarray, "P 2"], way: Float[np.ndarray, "2"] | Float[np.ndarray, "P 2"]
+    off: Float[np.ndarray, "P 2"], motion: Float[np.ndarray, "2"] | Float[np.ndarray, "P 2"]
 ) -> Float[np.ndarray, "P"]:
     """How far places are from where a motion leads, on which an object may stop anywhere."""
-    share = (off * way).sum(-1) / np.maximum((way * way).sum(-1), 1e-9)
-    return np.hypot(*(off - np.clip(share, 0, 1)[:, None] * way).T)
+    share = (off * motion).sum(-1) / np.maximum((motion * motion).sum(-1), 1e-9)
+    return np.hypot(*(off - np.clip(share, 0, 1)[:, None] * motion).T)
 
 
-def steadiness(ways: Sequence[Way]) -> float:
-    """Pixels a frame by which the motions of ways change, about: the root of their mean square."""
-    steps = [np.diff(way.trail, axis=1) for way in ways]
+def steadiness(hypotheses: Sequence[Hypothesis]) -> float:
+    """Pixels a frame by which motions change, about: the root of their mean square."""
+    steps = [np.diff(path.trail, axis=1) for path in hypotheses]
     before = np.concatenate([s[:, :-1].reshape(-1, 2) for s in steps])
     then = np.concatenate([s[:, 1:].reshape(-1, 2) for s in steps])
-    moves = np.hypot(*before.T) + np.hypot(*then.T) > MOVES * ways[0].breadth
-    least, most = (share * ways[0].breadth for share in STEADY)
+    moves = np.hypot(*before.T) + np.hypot(*then.T) > MOVES * hypotheses[0].breadth
+    least, most = (share * hypotheses[0].breadth for share in STEADY)
     changes = _beside(then[moves], before[moves])
     return float(np.clip(np.sqrt(np.mean(changes**2)), least, most)) if moves.any() else most
 
 
-def cheapest(start: Way, views: Sequence[View]) -> Way:
-    """The cheapest way on from a start, with what others cost more."""
-    ways = [start]
+def cheapest(start: Hypothesis, views: Sequence[View]) -> Hypothesis:
+    """The cheapest hypothesis from a start on, with what others cost more."""
+    hypotheses = [start]
     for view in views:
-        kept: dict[tuple, Way] = {}
-        for key, way in sorted((e for w in ways for e in w.onwards(view)), key=lambda e: e[1].cost):
-            kept[key] = kept[key].merged(way) if key in kept else way
-        ways = [w for w in kept.values() if w.cost < min(k.cost for k in kept.values()) + BEYOND]
-        ways = ways[:KEPT]
-    best, *rest = ways
-    for way in rest:
-        best = best.merged(way)
+        kept: dict[tuple, Hypothesis] = {}
+        for key, path in sorted(
+            (e for w in hypotheses for e in w.continued(view)), key=lambda e: e[1].cost
+        ):
+            kept[key] = kept[key].merged(path) if key in kept else path
+        hypotheses = [
+            w for w in kept.values() if w.cost < min(k.cost for k in kept.values()) + BEYOND
+        ]
+        hypotheses = hypotheses[:KEPT]
+    best, *rest = hypotheses
+    for path in rest:
+        best = best.merged(path)
     return best
 
 
@@ -222,7 +228,7 @@ def lasting(sure: Bool[np.ndarray, " F"]) -> Bool[np.ndarray, " F"]:
     return sure
 
 
-# Masks at the places of the cheapest way.
+# Masks at the places of the cheapest hypothesis.
 
 WHOLE = 0.4  # share of a place in the clicked frame from which it is an object, too
 MORE = 12  # places that are looked for beyond those that were clicked
@@ -252,7 +258,7 @@ def followed_together(
         places.append(places_of(odds, footage.person[i], shape, known, most))
         progress(0.7 * (i + 1) / count)
     at = [p.middle for k, p in enumerate(places[first]) if k < len(masks) or p.new > WHOLE]
-    start = Way.starting(shape.breadth, np.array(at), first, count)
+    start = Hypothesis.starting(shape.breadth, np.array(at), first, count)
 
     def view(i: int, last: int) -> View:
         given = [k for k, m in enumerate(masks) if i in m]
@@ -275,8 +281,8 @@ def followed_together(
         last, once = max(p.frame for p in found), min(p.frame for p in found)
         row[last:], row[once::-1] = lasting(row[last:]), lasting(row[once::-1])
     for i in range(count):
-        way = after if i >= first else before
-        drawn = _masks(evidence, shape, i, places[i], way.trail[:, i])
+        path = after if i >= first else before
+        drawn = _masks(evidence, shape, i, places[i], path.trail[:, i])
         for k, (name, track) in enumerate(tracks.items()):
             if k in drawn and sure[k, i]:
                 track.soft[i], track.confidence[i] = drawn[k]

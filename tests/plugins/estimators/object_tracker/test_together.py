@@ -1,4 +1,4 @@
-"""Equal objects: the places of a frame, joint ways through them, and discs that cross."""
+"""Equal objects: the places of a frame, joint paths through them, and discs that cross."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.together import (
     CLEAR,
     LONG,
+    Hypothesis,
     View,
-    Way,
     cheapest,
     groups_of,
     lasting,
@@ -53,12 +53,12 @@ def test_a_known_place_stays_first_and_one_object_has_one_place() -> None:
     assert places_of(odds_of(NOBODY), NOBODY, shape, [], 4) == []
 
 
-def ways_through(
+def tracked_through(
     frames: list[list[tuple[float, float]]],
     hidden: bool = False,
     given: dict[int, dict[int, int]] | None = None,
-) -> Way:
-    """The cheapest way of two objects of breadth 10 from the places of a first frame."""
+) -> Hypothesis:
+    """The cheapest hypothesis of two objects of breadth 10 from the places of a first frame."""
     views = [
         View(
             i, np.array(places, float).reshape(-1, 2), np.full(len(places), 0.8),
@@ -66,46 +66,48 @@ def ways_through(
         )
         for i, places in enumerate(frames)
     ]  # fmt: skip
-    start = Way.starting(10.0, views[0].places, 0, len(frames))
+    start = Hypothesis.starting(10.0, views[0].places, 0, len(frames))
     return cheapest(start, views[1:])
 
 
 def test_objects_that_cross_go_on_as_they_went_whatever_the_order_of_the_places() -> None:
     a = [(6.0 * i, 20 + 0.5 * i) for i in range(11)]
     b = [(60 - 6.0 * i, 26 - 0.5 * i) for i in range(11)]
-    way = ways_through([[p, q][:: -1 if i % 2 and i else 1] for i, (p, q) in enumerate(zip(a, b))])
-    assert np.allclose(way.trail, [a, b])
-    assert (way.margin > CLEAR).all()
+    found = tracked_through(
+        [[p, q][:: -1 if i % 2 and i else 1] for i, (p, q) in enumerate(zip(a, b))]
+    )
+    assert np.allclose(found.trail, [a, b])
+    assert (found.margin > CLEAR).all()
 
 
 def test_after_both_were_hidden_in_one_place_it_is_not_sure_which_is_which() -> None:
     """They meet behind something, and come out of it again one after the other."""
     met = [[(20.0, 20), (40.0, 20)], [(24.0, 20), (36.0, 20)], [], [], [], [], [], []]
     apart = [[(26.0, 20), (34.0, 20)], [(22.0, 20), (38.0, 20)], [(18.0, 20), (42.0, 20)]]
-    way = ways_through(met + apart, hidden=True)
-    assert np.isfinite(way.trail[:, -1]).all()
-    assert (way.margin[:, -3:] < CLEAR).all() and (way.margin[:, 1] > CLEAR).all()
+    found = tracked_through(met + apart, hidden=True)
+    assert np.isfinite(found.trail[:, -1]).all()
+    assert (found.margin[:, -3:] < CLEAR).all() and (found.margin[:, 1] > CLEAR).all()
     for clicked in (0, 1):  # in the last frame, which says it of those before as well
-        way = ways_through(met + apart, hidden=True, given={10: {0: clicked}})
-        assert np.allclose(way.trail[0, -1], apart[-1][clicked])
-        assert (way.margin[:, -3:] > CLEAR).all()
+        found = tracked_through(met + apart, hidden=True, given={10: {0: clicked}})
+        assert np.allclose(found.trail[0, -1], apart[-1][clicked])
+        assert (found.margin[:, -3:] > CLEAR).all()
 
 
 def test_an_object_that_another_passes_is_where_it_was() -> None:
     """One rests, hidden for two frames by the one that passes before it."""
     passing = [(10.0 + 8 * i, 22.0) for i in range(8)]
     frames = [[p, (42.0, 20.0)] if i not in (3, 4) else [p] for i, p in enumerate(passing)]
-    way = ways_through(frames)
-    assert np.allclose(way.trail[0], passing)
-    assert np.isnan(way.trail[1, 3:5]).all() and np.allclose(way.trail[1, 5:], (42, 20))
+    found = tracked_through(frames)
+    assert np.allclose(found.trail[0], passing)
+    assert np.isnan(found.trail[1, 3:5]).all() and np.allclose(found.trail[1, 5:], (42, 20))
 
 
 @pytest.mark.parametrize("rests", [False, True])
 def test_what_comes_to_a_place_that_looks_as_before_was_there_and_is_another(rests: bool) -> None:
-    start = Way.starting(10.0, np.array([(10.0, 20.0)]), 0, 2)
+    start = Hypothesis.starting(10.0, np.array([(10.0, 20.0)]), 0, 2)
     there, new = np.array([(16.0, 20.0)]), np.full(1, 0.8)
-    way = cheapest(start, [View(1, there, new, np.array([rests]), {}, lambda to: True)])
-    assert np.isnan(way.trail[0, 1]).all() == rests
+    found = cheapest(start, [View(1, there, new, np.array([rests]), {}, lambda to: True)])
+    assert np.isnan(found.trail[0, 1]).all() == rests
 
 
 def test_groups_are_of_what_was_clicked_in_one_frame_and_looks_alike() -> None:
