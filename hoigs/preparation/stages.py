@@ -21,7 +21,12 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.reporting import Progress, ranges
 from hoigs.preparation.body.mask_fit import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
-from hoigs.preparation.cameras.choose import BesideVideo, choose_cameras, known_lens
+from hoigs.preparation.cameras.choose import (
+    BesideVideo,
+    choose_cameras,
+    known_lens,
+    without_covered,
+)
 from hoigs.preparation.clip_writing import write_clip_folder
 from hoigs.preparation.depth import POOR, DepthSource, fit_depth, seen_points, seen_surface
 from hoigs.preparation.draft import Draft
@@ -263,10 +268,10 @@ def cameras(
     folder = draft.work.unfinished("cameras", key_of(draft, "cameras", options, files))
 
     def make() -> Draft:
-        chosen = choose_cameras(
-            draft.video, draft.estimates.person, draft.estimates.masks,
-            BesideVideo(source.colmap, source.cameras, draft.body_file), options, folder, progress,
-        )  # fmt: skip
+        person, masks = draft.estimates.person, draft.estimates.masks
+        beside = BesideVideo(source.colmap, source.cameras, draft.body_file)
+        chosen = choose_cameras(draft.video, person, masks, beside, options, folder, progress)
+        chosen = without_covered(chosen, person, masks)
         track = chosen.track.with_borders() if options.keep_borders else chosen.track
         return draft.noting(chosen.warnings, {"cameras": track.provenance}, track=track)
 

@@ -67,7 +67,7 @@ def choose_cameras(
     folder: Path,
     progress: Callable[[float], None],
 ) -> ChosenCameras:
-    """Cameras as `options.camera` requests them, without those of `covered_frames`.
+    """Cameras as `options.camera` requests them.
 
     Args:
         landmarks, masks: of the raw frames; landmarks None: nobody is looked for.
@@ -76,40 +76,6 @@ def choose_cameras(
     Raises:
         SourceError: the model does not fit, or structure from motion fails.
     """
-    chosen = _requested(video, landmarks, masks, beside, options, folder, progress)
-    covered = [i for i in covered_frames(landmarks, masks) if i in chosen.track.positions]
-    if len(covered) in (0, len(chosen.track.positions)):
-        return chosen
-    said = (
-        f"{len(covered)} frames ({ranges(covered)}) are left out: the person's mask covers most of "
-        "the image there and no body was found, as where a hand covers the lens"
-    )
-    return ChosenCameras(chosen.track.without(covered), [*chosen.warnings, said])
-
-
-COVERED = 0.6  # of the image, by a mask of the person
-
-
-def covered_frames(landmarks: Landmarks | None, masks: GivenMasks) -> list[int]:
-    """Frames in which the person's mask covers most of the image and no landmarks of a body were
-    found, as where a hand covers the lens: they show neither the person nor the scene. None if
-    these are half of the frames or more, as the video is a close-up then."""
-    people = masks.persons(None)
-    if people is None or landmarks is None:
-        return []
-    covered = (people.coverage() > COVERED) & ~landmarks.found.numpy()
-    return np.flatnonzero(covered).tolist() if covered.mean() < 0.5 else []
-
-
-def _requested(
-    video: Frames,
-    landmarks: Landmarks | None,
-    masks: GivenMasks,
-    beside: BesideVideo,
-    options: PrepareOptions,
-    folder: Path,
-    progress: Callable[[float], None],
-) -> ChosenCameras:
     lens = known_lens(options, video)
     model, given, bodies = beside.model, beside.cameras, beside.bodies
     made = None if options.own_cameras else given or model
@@ -137,6 +103,34 @@ def _requested(
         if motion is None or motion.turned is not None:
             return _turning(video, landmarks, masks, options, still_lens, motion, progress)
     return _from_motion(video, masks, options, lens, folder, progress)
+
+
+COVERED = 0.6  # of the image, by a mask of the person
+
+
+def covered_frames(landmarks: Landmarks | None, masks: GivenMasks) -> list[int]:
+    """Frames in which the person's mask covers most of the image and no landmarks of a body were
+    found, as where a hand covers the lens: they show neither the person nor the scene. None if
+    these are half of the frames or more, as the video is a close-up then."""
+    people = masks.persons(None)
+    if people is None or landmarks is None:
+        return []
+    covered = (people.coverage() > COVERED) & ~landmarks.found.numpy()
+    return np.flatnonzero(covered).tolist() if covered.mean() < 0.5 else []
+
+
+def without_covered(
+    chosen: ChosenCameras, landmarks: Landmarks | None, masks: GivenMasks
+) -> ChosenCameras:
+    """Cameras without those of `covered_frames`, and a warning that names these."""
+    covered = [i for i in covered_frames(landmarks, masks) if i in chosen.track.positions]
+    if len(covered) in (0, len(chosen.track.positions)):
+        return chosen
+    said = (
+        f"{len(covered)} frames ({ranges(covered)}) are left out: the person's mask covers most of "
+        "the image there and no body was found, as where a hand covers the lens"
+    )
+    return ChosenCameras(chosen.track.without(covered), [*chosen.warnings, said])
 
 
 def _turning(

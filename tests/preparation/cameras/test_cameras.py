@@ -17,7 +17,12 @@ from hoigs.preparation.cameras.camera_track import (
     pinhole,
     static_cameras,
 )
-from hoigs.preparation.cameras.choose import BesideVideo, ChosenCameras, choose_cameras
+from hoigs.preparation.cameras.choose import (
+    BesideVideo,
+    ChosenCameras,
+    choose_cameras,
+    without_covered,
+)
 from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.options import PrepareOptions
@@ -144,9 +149,10 @@ def test_frames_in_which_a_hand_covers_the_lens_are_left_out(
     def chosen(masks: np.ndarray) -> ChosenCameras:
         given = GivenMasks(human=MaskStack(masks))
         options = PrepareOptions(camera="static")
-        return choose_cameras(
+        found = choose_cameras(
             video, landmarks, given, BesideVideo(), options, tmp_path, lambda share: None
         )
+        return without_covered(found, landmarks, given)
 
     found = chosen(masks)
     assert found.track.positions == tuple(range(FRAMES - 1))
