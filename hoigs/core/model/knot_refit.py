@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -17,6 +18,7 @@ from hoigs.core.values.gaussians import Gaussians
 
 PROBES = 64  # Gaussians whose paths stand for all
 NEAR = 0.05  # metres; points nearer to the camera, or behind it, are not measured
+REACH = 3  # knots: a tangent by finite differences depends on the next knot, an interval on two
 REFITTED = 3  # how many of the best candidates for removal are tried with a refit
 
 
@@ -115,23 +117,31 @@ class ScreenMotion(nn.Module):
         """Every frame and every half frame."""
         return uniform_times(max(2 * len(self.frame_times) - 1, 2))
 
-    def paths(self, curve: HasKnots, canonical: Gaussians) -> Float[Tensor, "F P 2"]:
-        """Pixels of the Gaussians of `curve.traced` in every frame; NaN where not in front."""
-        return self.on_screen(curve.traced(canonical, self.frame_times))
+    def paths(
+        self, curve: HasKnots, canonical: Gaussians, frames: slice = slice(None)
+    ) -> Float[Tensor, "F P 2"]:
+        """Pixels of the Gaussians of `curve.traced` in every frame, or in some `frames`; NaN where
+        they are not in front."""
+        return self.on_screen(curve.traced(canonical, self.frame_times[frames]), frames)
 
-    def on_screen(self, points: Float[Tensor, "F P 3"]) -> Float[Tensor, "F P 2"]:
+    def on_screen(
+        self, points: Float[Tensor, "F P 3"], frames: slice = slice(None)
+    ) -> Float[Tensor, "F P 2"]:
         """Pixels of world points, one row per frame; NaN where they are not in front."""
-        points = points.float()
-        turn, shift = self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3]
-        camera = points @ turn.mT + shift[:, None]
-        pixels = camera @ self.intrinsics.mT
+        points, view = points.float(), self.world_to_camera[frames]
+        camera = points @ view[:, :3, :3].mT + view[:, :3, 3][:, None]
+        pixels = camera @ self.intrinsics[frames].mT
         return torch.where(camera[..., 2:] > NEAR, pixels[..., :2] / pixels[..., 2:], torch.nan)
 
     @staticmethod
-    def deviation(a: Float[Tensor, "F P 2"], b: Float[Tensor, "F P 2"]) -> float:
+    def distances(a: Float[Tensor, "F P 2"], b: Float[Tensor, "F P 2"]) -> Float[Tensor, " F"]:
+        """Mean distance over the Gaussians in each frame, pixels."""
+        return (a - b).norm(dim=-1).nanmean(1).nan_to_num(0.0)
+
+    @classmethod
+    def deviation(cls, a: Float[Tensor, "F P 2"], b: Float[Tensor, "F P 2"]) -> float:
         """Mean distance over the Gaussians in the worst frame, pixels."""
-        mean = (a - b).norm(dim=-1).nanmean(1)
-        return float(mean.nan_to_num(0.0).max())
+        return float(cls.distances(a, b).max())
 
 
 def cameras_of_frames(clip: Clip) -> list[Camera]:
@@ -156,12 +166,9 @@ def remove_knots(
     before, fit = screen.paths(curve, canonical), screen.sample_times()
     while len(curve.knots) > minimum:
         times = curve.knots.tolist()
-        trials = []
-        for k in range(1, len(times) - 1):
-            with KnotTrial(curve) as trial:
-                trial.leave_out(k)
-                trials.append((screen.deviation(before, screen.paths(curve, canonical)), k))
-        for _, k in sorted(trials)[:REFITTED]:  # each refit costs far more than leaving out
+        without = deviations_without(curve, canonical, screen, before)
+        trials = sorted(zip(without, range(1, len(times) - 1), strict=True))
+        for _, k in trials[:REFITTED]:  # each refit costs far more than leaving out
             with KnotTrial(curve) as trial:
                 trial.place(times[:k] + times[k + 1 :], fit)
                 if screen.deviation(before, screen.paths(curve, canonical)) <= pixels:
@@ -169,6 +176,27 @@ def remove_knots(
                     break
         else:
             return
+
+
+def deviations_without(
+    curve: HasKnots, canonical: Gaussians, screen: ScreenMotion, before: Float[Tensor, "F P 2"]
+) -> list[float]:
+    """`ScreenMotion.deviation` from `before` without each inner knot, the values at others kept.
+
+    Only the frames up to REACH knots away are traced anew, as a knot moves no others: all frames
+    for every knot would be most of the time of a pruning of a long clip.
+    """
+    times, frames = curve.knots.tolist(), screen.frame_times
+    off = screen.distances(before, screen.paths(curve, canonical))
+    found = []
+    for k in range(1, len(times) - 1):
+        start = bisect_left(frames, times[max(k - REACH, 0)])
+        near = slice(start, bisect_right(frames, times[min(k + REACH, len(times) - 1)]))
+        with KnotTrial(curve) as trial:
+            trial.leave_out(k)
+            here = screen.distances(before[near], screen.paths(curve, canonical, near))
+        found.append(float(torch.cat((off[:start], here, off[near.stop :])).max()))
+    return found
 
 
 def screen_of(clip: Clip) -> ScreenMotion:

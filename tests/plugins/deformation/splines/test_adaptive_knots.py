@@ -13,6 +13,7 @@ from hoigs.core.maths import splines
 from hoigs.core.maths.rotations import quats_to_matrices
 from hoigs.core.maths.splines import Knots
 from hoigs.core.model.entity import Entity
+from hoigs.core.model.knot_refit import KnotTrial, deviations_without
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
@@ -151,6 +152,24 @@ def test_inserting_knots_changes_no_place(kind):
         if "quats" in name:
             same, old[name] = quats_to_matrices(same), quats_to_matrices(old[name])
         torch.testing.assert_close(same, old[name], atol=1e-5, rtol=1e-4)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("tangents", ["learned", "finite-difference"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_knot_that_is_left_out_moves_the_frames_around_it_alone(kind, tangents):
+    """Of 17 knots, so that there are others; from a motion before, which all frames are off."""
+    entity = adaptive(kind, count=17, shake=0.1, tangents=tangents)
+    model, canonical = entity.deformation, entity.canonical.detach()
+    screen = model.schedule.screen
+    before = screen.paths(model, canonical) + 0.1 * torch.randn(FRAMES, 1, 2)
+    whole = []
+    for k in range(1, len(model.knots) - 1):
+        with KnotTrial(model) as trial:
+            trial.leave_out(k)
+            whole.append(screen.deviation(before, screen.paths(model, canonical)))
+    found = deviations_without(model, canonical, screen, before)
+    assert len(found) == 15 and found == pytest.approx(whole, abs=1e-4)
 
 
 @pytest.mark.parametrize("tangents", ["learned", "finite-difference"])
