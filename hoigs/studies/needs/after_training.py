@@ -159,8 +159,8 @@ def sentences(after: After) -> list[str]:
     """What the numbers of the table mean, and what each part cost."""
     frames = ", ".join(map(str, after.compacted.frames))
     found = [
-        f"dB: in the worse of two regions (people and objects; background), on frames {frames}, "
-        "which were held back from the search but not from the final training.",
+        "dB: in the worst of three regions (people and objects; objects; background), on frames "
+        f"{frames}, which were held back from the search but not from the final training.",
         f"Pruning and tuning: {after.spent:.0f} of {after.limit:.0f} steps.",
     ]
     whole = after.whole_cost

@@ -268,7 +268,7 @@ def region_of(
 
 # Validator: PSNR of a few frames by region, to measure what pruning costs.
 
-WATCHED = ("human_object", "background")
+WATCHED = ("human_object", "object", "background")  # a small object is little of the first
 
 
 @dataclass(frozen=True)
