@@ -77,7 +77,7 @@ def as_if_true(simple: Trial, rich: Trial) -> Clip:
 
 
 def _drawn(trial: Trial, frame: Frame) -> Float[Tensor, "H W 3"]:
-    """What a trial's model draws, before the frame itself."""
+    """What a trial's model draws over the pixels of the frame, 0 to 1."""
     model = trial.model
     training = model.training
     model.eval()
