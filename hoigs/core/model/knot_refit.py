@@ -57,10 +57,14 @@ class KnotTrial:
     def keep(self) -> None:
         self.kept = True
 
+    def restore(self) -> None:
+        """The knots and values as they were when this trial was made."""
+        self.curve.knots.place(self.times)
+        self._set(self.values)
+
     def __exit__(self, *error: object) -> None:
         if not self.kept:
-            self.curve.knots.place(self.times)
-            self._set(self.values)
+            self.restore()
 
     def _set(self, values: Mapping[str, Tensor]) -> None:
         for name, value in values.items():
@@ -155,15 +159,25 @@ def cameras_of_frames(clip: Clip) -> list[Camera]:
 
 
 def remove_knots(
-    curve: HasKnots, canonical: Gaussians, screen: ScreenMotion, *, pixels: float, minimum: int
+    curve: HasKnots,
+    canonical: Gaussians,
+    screen: ScreenMotion,
+    *,
+    pixels: float,
+    minimum: int,
+    before: Float[Tensor, "F P 2"] | None = None,
 ) -> None:
     """Take out movable knots, the least needed first, down to `minimum`, as long as the refitted
     motion stays within `pixels` of the motion before the first removal.
 
     This is the criterion of SplineGS (Park et al. 2025), measured in the worst frame instead of
     the mean over all frames, so that a long quiet clip does not hide one jerk.
+
+    Args:
+        before: `screen.paths` of the motion to stay near; that of `curve` as it is if None.
     """
-    before, fit = screen.paths(curve, canonical), screen.sample_times()
+    before = screen.paths(curve, canonical) if before is None else before
+    fit = screen.sample_times()
     while len(curve.knots) > minimum:
         times = curve.knots.tolist()
         without = deviations_without(curve, canonical, screen, before)

@@ -259,10 +259,7 @@ class RigidSpline(Keyframed):
         shapes = torch.stack([self.shape(canonical, time)[0][rows] for time in times])
         turned = (shapes - self.center) @ quats_to_matrices(quats).mT
         paths = turned + (places + self.center)[:, None]
-        if self.carrier is None:
-            return paths
-        carried = [self.carrier.carry(x, time) for x, time in zip(paths, times, strict=True)]
-        return torch.stack(carried)
+        return paths if self.carrier is None else self.carrier.carry_paths(paths, times)
 
     @torch.no_grad()
     def resampled(self, times: Sequence[float], fit: Sequence[float]) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -22,6 +23,8 @@ from hoigs.core.maths.splines import (
     Interval,
     Knots,
     catmull_rom,
+    cubic_hermite,
+    finite_differences,
     keyframe_position,
     knot_pair,
     uniform_times,
@@ -83,6 +86,18 @@ class RigidTrack(nn.Module):
         """Points of the object's frame in the world at `time`."""
         rotation, translation = self.at(time)
         return means @ quats_to_matrices(rotation).mT + translation
+
+    def carry_paths(
+        self, paths: Float[Tensor, "T P 3"], times: Sequence[float]
+    ) -> Float[Tensor, "T P 3"]:
+        """`carry` of other points at each of T times, in a few operations for all of them."""
+        found = [self._position(time) for time in times]
+        k = torch.tensor([at.k for at in found], device=self.quats.device)
+        at = Interval(k, self.translations.new_tensor([at.r for at in found])[:, None])
+        tangents = finite_differences(self.translations[None])[0]
+        translations = cubic_hermite(self.translations, tangents, at)
+        rotations = quats_to_matrices(slerp(self.quats[k], self.quats[k + 1], at.r))
+        return paths @ rotations.mT + translations[:, None]
 
     def place(
         self, means: Float[Tensor, "N 3"], quats: Float[Tensor, "N 4"], time: Time

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hoigs.core.device import Time
 from hoigs.core.maths.rotations import multiply_quats
 from hoigs.core.model.knot_refit import probe_rows
 from hoigs.core.values.gaussians import Gaussians
@@ -97,10 +96,8 @@ class TrackedHermite(CubicHermite):
         return moved.replace(opacity_logits=logits)
 
     def means_at(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
-        return self._carried(canonical.means + self._means(moment.time), moment.time)
-
-    def _carried(self, means: Float[Tensor, "N 3"], time: Time) -> Float[Tensor, "N 3"]:
-        return means if self.carrier is None else self.carrier.carry(means, time)
+        means = canonical.means + self._means(moment.time)
+        return means if self.carrier is None else self.carrier.carry(means, moment.time)
 
     def velocity(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """tau(t) = R (CHS' + omega x (p + CHS)) + T', exact, metres per keyframe interval."""
@@ -113,9 +110,8 @@ class TrackedHermite(CubicHermite):
     @torch.no_grad()
     def traced(self, canonical: Gaussians, times: Sequence[float]) -> Float[Tensor, "T P 3"]:
         offsets = super().traced(canonical, times)
-        means = canonical.means[probe_rows(len(canonical)).to(canonical.means.device)]
-        pairs = zip(offsets, times, strict=True)
-        return torch.stack([self._carried(means + offset, time) for offset, time in pairs])
+        paths = offsets + canonical.means[probe_rows(len(canonical)).to(canonical.means.device)]
+        return paths if self.carrier is None else self.carrier.carry_paths(paths, times)
 
     def peak_opacity_logits(self, canonical: Gaussians) -> Float[Tensor, " N"]:
         logits = canonical.opacity_logits

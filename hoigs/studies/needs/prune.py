@@ -40,16 +40,29 @@ FEWEST_UNIFORM, FEWEST_MOVABLE = 2, 4
 
 
 @torch.no_grad()
-def remove_movable(
-    curve: HasKnots, canonical: Gaussians, screen: ScreenMotion, pixels: float
-) -> int:
-    """Take knots out of an adaptive spline as long as nothing moves by more than `pixels`; returns
-    how many."""
-    before = len(curve.knots)
+def fewer_movable(
+    curve: HasKnots, canonical: Gaussians, screen: ScreenMotion, bounds: Sequence[float]
+) -> list[tuple[float, KnotTrial]]:
+    """What is left of an adaptive spline's knots for each bound, pixels: bound, and the knots to
+    restore; only where there are fewer than with the bound before.
+
+    A looser bound goes on where a tighter one stopped, which traces each removal once. The curve
+    is left with the fewest.
+
+    Args:
+        bounds: of motion, ascending.
+    """
+    found = []
     with on_host(curve):
         near = canonical.to("cpu")
-        remove_knots(curve, near, screen, pixels=pixels, minimum=FEWEST_MOVABLE)
-    return before - len(curve.knots)
+        before = screen.paths(curve, near)
+    for pixels in bounds:
+        count = len(curve.knots)
+        with on_host(curve):
+            remove_knots(curve, near, screen, pixels=pixels, minimum=FEWEST_MOVABLE, before=before)
+        if len(curve.knots) < count:
+            found.append((pixels, KnotTrial(curve)))
+    return found
 
 
 @torch.no_grad()
@@ -336,21 +349,20 @@ class Pruning:
     def _movable(self, name: str, curve: HasKnots) -> None:
         """Knots of one adaptive spline."""
         canonical, before = self.trained.model.entity(name).canonical, len(curve.knots)
-        what, drop, screen = f"knots of {name}", 0.0, screen_of(self.trained.clip)
-        for pixels in PIXELS:
-            if not self.validator.affordable:
-                return
-            with KnotTrial(curve) as trial:
-                gone = remove_movable(curve, canonical, screen, pixels)
-                if not gone:
-                    break
+        what, drop = f"knots of {name}", 0.0
+        with KnotTrial(curve) as trial:
+            fewer = fewer_movable(curve, canonical, screen_of(self.trained.clip), PIXELS[::-1])
+            for pixels, less in reversed(fewer):
+                if not self.validator.affordable:
+                    return
+                less.restore()
                 after = self.validator.score(self.trained.model)
                 drop = self.now.drop_to(after)
                 if drop <= self.visible:
                     trial.keep()
-                    self.now = after
-                    why = f"refitted with {before - gone}, nothing moves by {pixels:g} pixel"
-                    self._record(Cut(what, "knots", before, before - gone, drop, why))
+                    self.now, left = after, len(curve.knots)
+                    why = f"refitted with {left}, nothing moves by {pixels:g} pixel"
+                    self._record(Cut(what, "knots", before, left, drop, why))
                     return
         self._knots_kept(what, before, drop)
 

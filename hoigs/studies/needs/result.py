@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -37,10 +37,11 @@ def cheapest_refit(
 ) -> int:
     """Index of the cheapest candidate that can reproduce the motion of the chosen one.
 
-    The chosen one itself unless its deformations are splines over knots (`HasKnots`). Compared with
-    it are candidates of the same class: with fewer uniform knots, refitted to its motion, or with
-    other settings (a spline in place of a track), by the motion that they learned; and those that
-    do not move, which take its Gaussians halfway through the clip.
+    The chosen one itself unless its deformations are splines over knots (`HasKnots`). Where it has
+    to move unlike another (`Candidate.moves_unlike`) and does not, that one is compared further.
+    Compared with it are candidates of the same class: with fewer uniform knots, refitted to its
+    motion, or with other settings (a spline in place of a track), by the motion that they learned;
+    and those that do not move, which take its Gaussians halfway through the clip.
 
     Args:
         candidates: that were tried, cheapest first. place: index of the chosen one. trials: by name
@@ -51,15 +52,20 @@ def cheapest_refit(
     if not all(has_knots(entity.deformation) for entity in entities):
         return place
     screen = screen_of(clip)
-    for cheaper in range(place):
+
+    def holds(cheaper: int, how: Callable[..., bool]) -> bool:
         trial = trials[candidates[cheaper].name]
         others = [trial.model.entity(name).deformation for name in chosen.names]
-        if all(
-            _held(entity.deformation, other, entity.canonical.detach(), screen)
+        return all(
+            how(entity.deformation, other, entity.canonical.detach(), screen)
             for entity, other in zip(entities, others, strict=True)
-        ):
-            return cheaper
-    return place
+        )
+
+    for cheaper in range(place):
+        unlike = candidates[cheaper].name == candidates[place].moves_unlike
+        if unlike and holds(cheaper, _moves_alike):
+            return cheapest_refit(candidates, cheaper, trials, clip)
+    return next((cheaper for cheaper in range(place) if holds(cheaper, _held)), place)
 
 
 @torch.no_grad()
@@ -90,15 +96,26 @@ def _held(
         if type(cheaper) is not type(curve) or not has_knots(cheaper):
             return False
         if not _same_but_knots(curve, cheaper):
-            with on_host(cheaper):
-                learned = screen.paths(cheaper, canonical)
-            return screen.deviation(before, learned) <= UNSEEN
+            return _moves_alike(curve, cheaper, canonical, screen)
         count = len(cheaper.knots)
         if cheaper.knots.movable or count >= len(curve.knots):
             return False
         with as_movable(curve), KnotTrial(curve) as trial:
             trial.place(uniform_times(count), screen.sample_times())
             return screen.deviation(before, screen.paths(curve, canonical)) <= UNSEEN
+
+
+@torch.no_grad()
+def _moves_alike(
+    curve: DeformationModel, other: DeformationModel, canonical: Gaussians, screen: ScreenMotion
+) -> bool:
+    """Whether two motions with knots, as they were learned, are within `UNSEEN` pixels."""
+    if not (has_knots(curve) and has_knots(other)):
+        return False
+    canonical = canonical.to("cpu")
+    with on_host(curve), on_host(other):
+        paths = [screen.paths(model, canonical) for model in (curve, other)]
+    return screen.deviation(*paths) <= UNSEEN
 
 
 def _same_but_knots(one: object, other: object) -> bool:

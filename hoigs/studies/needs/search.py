@@ -127,6 +127,11 @@ class Search:
     def _searched(self, space: SearchSpace) -> bool:
         return self.settings.smallest or not space.smallest_only
 
+    def _turn_unknown(self, block: str) -> bool:
+        """Whether the clip has a track of an object of the block, but not how it turns."""
+        tracks = [self.clip.objects[n] for n in self._names(block) if n in self.clip.objects]
+        return any(not track.rotation_known for track in tracks)
+
     def _settled(self, full: Spec) -> bool:
         """Whether the base spec or the user sets how rates end."""
         given = {setting.partition("=")[0].strip() for setting in self.given}
@@ -180,6 +185,10 @@ class Search:
             if not untried:
                 return Answer(space, block, None, skipped=UNTRIED)
             return self._chosen(space, block, untried[0], blocks, skipped=UNTRIED)
+        if space.turn_unknown and not self.settings.smallest and self._turn_unknown(block):
+            return self._chosen(
+                space, block, space.turn_unknown, blocks, skipped=space.turn_unknown.why
+            )
         held, apart = len(self.held), CALIBRATION * budget if space.calibrated else 0.0
         budget -= apart
         try:

@@ -37,6 +37,9 @@ class Candidate(ComponentConfig):
     afterwards: Overrides = Field(default_factory=dict)
     """Overrides of the answer if this candidate is chosen, but of no trial: settings that need a
     longer training."""
+    moves_unlike: str | None = None
+    """A cheaper candidate of the space, which is taken in its place where the motions that both
+    learned are within half a pixel: parts that do not move against each other are one."""
     cost: float = Field(default=1.0, gt=0)
     """Of one step of a trial, where a step of the full spec costs 1
     (`benchmarks/candidate_costs.py` measures it)."""
@@ -76,6 +79,9 @@ class SearchSpace(ComponentConfig):
     untried: str | None = None
     """Candidate that is taken where `smallest_only` keeps the space from being searched; None
     changes nothing."""
+    turn_unknown: Candidate | None = None
+    """What an object gets, untried, whose turn the clip does not know, but for the smallest model;
+    None searches as for any other."""
 
 
 class _File(ComponentConfig):
@@ -113,6 +119,13 @@ def _check(search_spaces: Sequence[SearchSpace], path: Path) -> None:
             raise HoigsError(
                 f"{path} {space.name}.untried: it has no candidate {space.untried!r}{near}"
             )
+        for place, candidate in enumerate(space.candidates):
+            if candidate.moves_unlike not in (None, *names[:place]):
+                near = did_you_mean(str(candidate.moves_unlike), names[:place])
+                raise HoigsError(
+                    f"{path} {space.name}.{candidate.name}.moves_unlike: no candidate "
+                    f"{candidate.moves_unlike!r} above it{near}"
+                )
         if len(set(names)) < len(names) or space.name in before:
             raise HoigsError(
                 f"{path} {space.name}: search spaces and their candidates need unique names"

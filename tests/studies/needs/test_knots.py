@@ -149,6 +149,28 @@ def test_a_motion_that_fewer_knots_hold_gets_fewer(clip):
     assert candidate_of(eight) == 3
 
 
+@pytest.mark.parametrize("apart", [0.0, 1.0])
+def test_parts_that_move_as_one_piece_are_one(clip, apart):
+    """Whatever they score: a joint that does not turn is of no use, one that turns is kept."""
+
+    def bent(t: float) -> torch.Tensor:
+        return torch.tensor([0.5 * t + apart * math.sin(6.3 * t) / 5, 0.1 * t, 0.0])
+
+    parts = moving(clip, 9, bent)
+    parts.deformation.__class__ = type("Parts", (type(parts.deformation),), {})
+    straight = lambda t: torch.tensor([0.5 * t, 0.1 * t, 0.0])  # noqa: E731
+    models = [
+        SceneModel({"object": entity}, rasterizer=OracleRasterizer())
+        for entity in (moving(clip, 2, straight), moving(clip, 9, straight), parts)
+    ]
+    trials = trials_of(*models)
+    candidates = [Candidate(name=name, why="it does") for name in trials]
+    assert cheapest_refit(candidates, 2, trials, clip) == 2  # type: ignore[arg-type]
+    candidates[2] = candidates[2].model_copy(update={"moves_unlike": "1"})
+    # the one piece is then held by fewer knots
+    assert cheapest_refit(candidates, 2, trials, clip) == (2 if apart else 0)  # type: ignore[arg-type]
+
+
 def test_a_refit_of_movable_knots_leaves_their_tangents_what_they_are(clip):
     """They are per interval of the knots that it began with, however many there are now."""
     entity = moving(clip, 5, lambda t: torch.tensor([0.4 * t, 0.1 * t, 0.0]))

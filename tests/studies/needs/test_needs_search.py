@@ -239,6 +239,19 @@ def test_an_invalid_candidate_is_an_error(clip):
         Search(clip, "hoigs", (space,), GIVEN).run()
 
 
+@pytest.mark.parametrize("smallest", [False, True])
+def test_an_object_that_turns_unseen_is_not_tried_as_rigid(clip, smallest):
+    ball = replace(clip.objects["object"], rotation_known=False)
+    unseen = replace(clip, objects={"object": ball})
+    free = SPLINE.model_copy(update={"name": "free", "why": "nobody knows how it turns"})
+    space = OBJECT.model_copy(update={"turn_unknown": free})
+    settings = Settings(smallest=smallest)
+    for of, taken in ((unseen, not smallest), (clip, False)):
+        answer = Search(of, "hoigs", (space,), GIVEN, settings).run().answers[0]
+        assert (answer.chosen is free and not answer.steps) == taken
+        assert ("because nobody knows how it turns" in summary_line(answer)) == taken
+
+
 def test_a_still_object_needs_no_interaction(clip):
     """A skipped search space takes its cheapest candidate, untried."""
     still = OBJECT.model_copy(

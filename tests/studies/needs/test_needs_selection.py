@@ -232,6 +232,11 @@ def test_the_built_in_search_spaces_are_valid():
             " candidates: [{name: planes, why: y}, {name: z, why: y}]}]",
             "no candidate 'plane'; did you mean .planes",
         ),
+        (
+            "search_spaces: [{name: a, kind: object, candidates: [{name: parts, why: y,"
+            " moves_unlike: pieces}, {name: piece, why: y}]}]",
+            "no candidate 'pieces' above it",
+        ),
     ],
 )
 def test_search_spaces_of_a_file_are_checked(tmp_path, text, message):

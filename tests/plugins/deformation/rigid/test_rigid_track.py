@@ -53,12 +53,22 @@ def test_velocity_is_the_derivative_where_frames_are_uneven(time: float) -> None
         torch.testing.assert_close(found, 0.25 * (after - before) / (2 * step), atol=2e-3, rtol=0)
 
 
+@pytest.mark.parametrize("uneven", [True, False])
+def test_paths_are_carried_as_each_time_alone(uneven: bool) -> None:
+    given = track() if uneven else replace(track(), times=None)
+    motion, times = RigidTrack(given), [0.0, 0.13, 0.2, 0.5, 0.99, 1.0]
+    paths = torch.randn(len(times), 5, 3)
+    alone = [motion.carry(points, time) for points, time in zip(paths, times, strict=True)]
+    torch.testing.assert_close(motion.carry_paths(paths, times), torch.stack(alone))
+
+
 def test_a_single_frame_stands_still() -> None:
     given = track((0.0,), frames=1)
     motion, points = RigidTrack(given), torch.randn(3, 3)
     for time in (0.0, 0.4, 1.0):
         where = points @ given.rotations[0].T + given.translations[0]
         torch.testing.assert_close(motion.carry(points, time), where)
+        torch.testing.assert_close(motion.carry_paths(points[None], [time])[0], where)
     own = torch.randn(3, 3)
     moving = motion.velocity(points, 0.4, own, unit=0.1)
     torch.testing.assert_close(moving, own @ given.rotations[0].T)
