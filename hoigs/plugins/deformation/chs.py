@@ -18,6 +18,7 @@ from hoigs.core.maths.rotations import (
 )
 from hoigs.core.maths.splines import uniform_times
 from hoigs.core.model.knot_refit import probe_rows
+from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.core.values.tokens import Residual, displaced
@@ -30,7 +31,8 @@ class CubicHermiteConfig(KeyframedConfig):
 
     opacity: Literal["keyed", "constant", "auto"] = "keyed"
     """"keyed" over time, linear between knots (the paper), or "constant"; "auto": constant, but
-    keyed where the track does not know how the object turns, so that sides come and go."""
+    keyed where the track does not know how the object turns, so that sides come and go, and where
+    the object is not seen at the start or the end of the clip, so that it does itself."""
 
 
 class CubicHermite(Keyframed):
@@ -69,7 +71,8 @@ class CubicHermite(Keyframed):
         super().__init__(config, **given)
         self.keyed = self.config.opacity == "keyed"
         if self.config.opacity == "auto" and self._track is not None:
-            self.keyed = not self._track.rotation_known
+            comes_or_goes = _unseen_at_an_end(self._track) >= self.config.keyframe_step
+            self.keyed = comes_or_goes or not self._track.rotation_known
         names = ["keyframe_means", "keyframe_quats"]
         names += ["tangents"] if self.learned else []
         names += ["opacity_logits"] if self.keyed else []
@@ -194,3 +197,9 @@ class CubicHermite(Keyframed):
     def regularizers(self) -> dict[str, Tensor]:
         """As `knot_penalties`, of each Gaussian's means."""
         return self.knot_penalties(self.keyframe_means, self.tangents if self.learned else None)
+
+
+def _unseen_at_an_end(track: ObjectTrack) -> int:
+    """Frames before the object is first observed or after it last is, whichever are more."""
+    seen = track.observed.nonzero().flatten().tolist()
+    return max(seen[0], len(track.observed) - 1 - seen[-1]) if seen else 0

@@ -106,9 +106,7 @@ def _held(
 
 
 @torch.no_grad()
-def _moves_alike(
-    curve: DeformationModel, other: DeformationModel, canonical: Gaussians, screen: ScreenMotion
-) -> bool:
+def _moves_alike(curve: object, other: object, canonical: Gaussians, screen: ScreenMotion) -> bool:
     """Whether two motions with knots, as they were learned, are within `UNSEEN` pixels."""
     if not (has_knots(curve) and has_knots(other)):
         return False

@@ -220,3 +220,15 @@ def test_opacities_are_keyed_where_nothing_says_how_the_object_turns():
     outline = replace(track, rotation_known=False)
     assert entity_of(outline, opacity="auto").deformation.keyed
     assert not entity_of(outline, opacity="constant").deformation.keyed
+
+
+@pytest.mark.parametrize(("unseen", "keyed"), [((0, 4), True), ((0, 3), False), ((5, 12), False)])
+def test_opacities_are_keyed_where_the_object_comes_or_goes(unseen, keyed):
+    """Not where it is hidden for a while: what is hidden is still there."""
+    track = jittering_track()
+    for flipped in (False, True):
+        observed = torch.ones_like(track.observed)
+        observed[slice(*unseen)] = False
+        observed = observed.flip(0) if flipped else observed
+        entity = entity_of(replace(track, observed=observed), opacity="auto")
+        assert entity.deformation.keyed == keyed
