@@ -243,6 +243,7 @@ class HexPlaneSkinning(_HexPlaneSkinning):
         residual_rule: Literal['add', 'compose'] = ...,
         nonrigid: bool | Literal['auto', 'shading'] = ...,
         nonrigid_motion: _NonRigidConfig = ...,
+        shading: _NonRigidConfig | None = ...,
         laplacian: Literal['points', 'mesh'] = ...,
         laplacian_of: Sequence[Literal['offset', 'scale', 'color']] = ...,
         body: _BodyModel,

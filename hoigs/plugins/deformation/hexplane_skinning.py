@@ -134,6 +134,8 @@ class HexPlaneSkinningConfig(SkinnedBodyConfig):
     the paper's Eq. 5."""
     nonrigid_motion: NonRigidConfig = Field(default_factory=NonRigidConfig)
     """Sizes of what `nonrigid` learns."""
+    shading: NonRigidConfig | None = None
+    """Sizes where it is "shading", which is smoother than motion; None: as `nonrigid_motion`."""
     laplacian: LaplacianOn = "points"
     """Where L_reg of psi_h is taken: over neighbouring "points", the Gaussians, at no further cost;
     or over the vertices of the body's "mesh" (the paper), by a second pass of psi_h, but then
@@ -210,8 +212,10 @@ class HexPlaneSkinning(SurfaceBody):
         self.head = CanonicalHead(self.planes.width, len(body.parents), config.width, config.head)
         self.nonrigid: NonRigid | None = None
         if config.nonrigid:
-            kind = Shading if config.nonrigid == "shading" else NonRigidMotion
-            self.nonrigid = kind(config.nonrigid_motion, self.num_frames or 0)
+            shading = config.nonrigid == "shading"
+            kind = Shading if shading else NonRigidMotion
+            sizes = (config.shading if shading else None) or config.nonrigid_motion
+            self.nonrigid = kind(sizes, self.num_frames or 0)
         owned: set[str] = set() if config.free_attributes == "all" else {"means", "quats"}
         owned |= {"opacity_logits"} if self.opaque else set()
         if not config.free_attributes:
