@@ -24,8 +24,10 @@ from hoigs.preparation.body.fit_problem import (
     Unknowns,
 )
 from hoigs.preparation.body.fitted import BodyErrors, BodyFit, Joint
+from hoigs.preparation.body.girths import girths
 from hoigs.preparation.body.kinematics import PER_FRAME, REACH, NormalEquations, nearest_turn
 from hoigs.preparation.body.landmarks import ENOUGH
+from hoigs.preparation.body.mask_fit import Masks
 from hoigs.preparation.body.start import first_guess
 
 # Gauss-Newton on the energy of the body fit.
@@ -35,6 +37,7 @@ ESTIMATED = (6, 9, 12)  # steps before which ordinary motion is estimated anew
 RESCALED = (4, 8, 11)
 SETTLED = 14  # steps after which nothing but convergence is left to wait for
 ENOUGH_GAIN = 1e-3  # of the energy, below which a step is the last
+MASKS, AFTER = 24, 2  # frames whose masks show the girths, at most; steps after that
 
 
 def solve(problem: FitProblem, steps: int, progress: Callable[[float], None] | None) -> Unknowns:
@@ -57,6 +60,29 @@ def solve(problem: FitProblem, steps: int, progress: Callable[[float], None] | N
             break
     if progress is not None:
         progress(1.0)
+    return unknowns
+
+
+def with_girths(
+    problem: FitProblem, unknowns: Unknowns, masks: Masks, frames: Int[Tensor, " S"]
+) -> Unknowns:
+    """A solved problem solved on, with the body's girths by its masks.
+
+    Args:
+        masks: of the clip. frames: of it, those of the problem.
+    """
+    rows = problem.seen.nonzero()[:, 0]
+    rows = rows[torch.linspace(0, len(rows) - 1, MASKS).round().long()].unique()
+    shown = {int(row): masks[int(frames[row])] for row in rows}
+    cameras = [camera.scaled(unknowns.scale) for camera in problem.cameras]
+    betas = girths(problem.body, unknowns.pose, cameras, shown)
+    problem.shape = betas - unknowns.pose.betas
+    unknowns = replace(unknowns, pose=unknowns.pose.replace(betas=betas))
+    damping = DAMPING
+    for _ in range(AFTER):
+        unknowns, damping, gain = _improved(problem, unknowns, 1.0, damping)
+        if gain < ENOUGH_GAIN:
+            break
     return unknowns
 
 
@@ -108,6 +134,8 @@ def fit_in_windows(
     if seen.points is not None:
         known.ground = seen.points
     shared = solve(known, options.steps, partial(share, 0))
+    if seen.masks is not None:
+        shared = with_girths(known, shared, seen.masks, rows)
     found = Found(
         known.noise, known.motion.ordinary, shared.pose.betas, shared.offsets, shared.unit
     )
@@ -227,5 +255,7 @@ def fit_body(
         if seen.masks is not None:
             problem.show(seen.masks)
         unknowns = solve(problem, options.steps, progress)
+        if seen.masks is not None:
+            unknowns = with_girths(problem, unknowns, seen.masks, torch.arange(len(found)))
         errors = body_errors(problem, unknowns, problem.size.spread)
         return problem.result(unknowns, problem.misses(unknowns), errors)

@@ -290,6 +290,7 @@ class FitProblem:
         apart = torch.nn.functional.pad(steps, (1, 1), value=float(steps.median()))
         self.spacing = 0.5 * (apart[1:] + apart[:-1])  # seconds that each frame stands for
         self.in_space *= (self.spacing / SPACE_LASTS).clamp_max(1.0)[:, None]
+        self.shape = torch.zeros(body.num_betas, dtype=torch.float64)  # most probable
         self.prior = PosePrior(turns)
         torso = [self.points.index(mark) for mark in TORSO]
         self.motion = MotionPrior(self.kinematics, torso, len(rows), times, options.smooth)
@@ -543,7 +544,7 @@ class FitProblem:
         spread = self.offset_spread.repeat_interleave(3) * size
         shape = torch.full_like(betas, self.options.shape)
         spreads = torch.cat((shape, spread, torch.full_like(unit, self.options.unit)))
-        values = torch.cat((betas, unknowns.offsets.flatten(), unit)) / spreads
+        values = torch.cat((betas - self.shape, unknowns.offsets.flatten(), unit)) / spreads
         larger = (size - mean) / self.options.size
         if equations is not None:
             derivatives = torch.diag(spreads.reciprocal())
