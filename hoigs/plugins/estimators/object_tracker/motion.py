@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 
-BESIDE = (2, 6)  # frames before and after: the nearest that the footage has of these
+BESIDE, FARTHEST = 2, 6  # frames before and after: of these the nearest that the footage has
 REACH = 9  # quarters of its pixels that a pixel may move between: 36 pixels
 LARGEST = 40.0  # difference of colours from which pixels differ entirely
 SAME = (1.4, 2.0)  # a motion explains a pixel up to so much of its own best cost, and more
@@ -38,7 +38,7 @@ class Motion:
         here, number, beside = _halved(footage.colors(i)), footage.numbers[i], []
         for way in (-1, 1):
             apart = [(way * (n - number), k) for k, n in enumerate(footage.numbers)]
-            near = min((a for a in apart if BESIDE[0] <= a[0] <= BESIDE[1]), default=None)
+            near = min((a for a in apart if BESIDE <= a[0] <= FARTHEST), default=None)
             if near is not None:
                 there = _halved(footage.colors(near[1]))
                 shift = _shifts(here, there)

@@ -37,7 +37,7 @@ from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
 
 PROVEN = 0.5  # agreement from which a mask is proven by itself
-CARRIED = 0.3  # and from which it is by the frames beside it, from which it does not differ much
+CARRIED = 0.3  # and from which it is by proven ones before and after it, without a gap
 SIZES = (0.3, 1.5)  # of its usual area about then: half hidden, and not with a thing beside it
 AROUND = 6  # proven frames before and after a frame that say what is usual
 AGAIN = (0.05, 0.7)  # more agreement for each frame without it before, and most that is asked for
@@ -229,29 +229,39 @@ def _continued(
 
     From each prompted frame outwards: a frame follows the last one that was believed if the object
     moved no farther than its motion so far foretells, or if enough frames were missed for it to
-    have come there; one that is half proven follows only the frame beside it. The longer the object
-    was not seen, the surer it must be: what is where it was looks like it more often than not.
+    have come there. Half proven ones are believed where they lead from a proven frame to another
+    without a gap: a mask that drifts off the object never comes to one. The longer the object was
+    not seen, the surer it must be: what is where it was looks like it more often than not.
     """
     found = np.zeros(len(masks), bool)
     found[given] = True
     place = np.array([center_of(m) if m.any() else (np.nan, np.nan) for m in masks])
     size = 2 * np.sqrt(masks.sum((1, 2)) / np.pi)
+
+    def follows(i: int, last: int, speed: Float[np.ndarray, "2"]) -> bool:
+        gap, way = abs(i - last), place[i] - place[last]
+        off = min(np.hypot(*(way - speed * gap)), np.hypot(*way))
+        least = CARRIED if gap == 1 else min(PROVEN + AGAIN[0] * (gap - 1), AGAIN[1])
+        return bool(agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap)
+
     for start in given:
         for step in (1, -1):
-            last, speed = start, np.zeros(2)
+            last, speed, half = start, np.zeros(2), list[int]()
+            proven = (last, speed)
             for i in range(start + step, len(masks) if step > 0 else -1, step):
                 if i in given:
+                    found[half] = True
                     break
-                gap = abs(i - last)
-                off = np.hypot(*(place[i] - place[last] - speed * gap))
-                off = min(off, np.hypot(*(place[i] - place[last])))
-                reach = STEP * max(size[i], size[last]) * gap
-                least = CARRIED if gap == 1 else min(PROVEN + AGAIN[0] * (gap - 1), AGAIN[1])
-                if agreement[i] < least or not off <= reach:
+                if half and not follows(i, last, speed):
+                    (last, speed), half = proven, []
+                if not follows(i, last, speed):
                     continue
                 moved = place[i] - place[last]
-                speed = 0.5 * (speed + moved) if gap == 1 else np.zeros(2)
-                found[i], last = True, i
+                speed = 0.5 * (speed + moved) if abs(i - last) == 1 else np.zeros(2)
+                last, half = i, [*half, i]
+                if agreement[i] >= PROVEN:
+                    found[half] = True
+                    proven, half = (last, speed), []
     return found
 
 

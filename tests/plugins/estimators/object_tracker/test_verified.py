@@ -103,6 +103,14 @@ def test_the_longer_it_was_not_seen_the_surer_it_must_be() -> None:
     assert _continued(masks, agreement, [0]).astype(int).tolist() == [1, 0, 0, 0, 0, 0, 0, 1]
 
 
+def test_half_proven_frames_count_only_on_the_way_to_a_proven_one() -> None:
+    masks = np.stack([disc(40, 40)] * 6)
+    agreement = np.array([1.0, 0.4, 0.4, 0.6, 0.4, 0.4])
+    assert _continued(masks, agreement, [0]).astype(int).tolist() == [1, 1, 1, 1, 0, 0]
+    agreement[2:4] = 0.1, 0.8
+    assert _continued(masks, agreement, [0]).astype(int).tolist() == [1, 0, 0, 1, 0, 0]
+
+
 def test_cells_are_small_beside_the_thickness_of_a_flat_thing() -> None:
     """What is around a cell says of a pan that is seen from its side what it is in front of."""
     assert half_breadth(disc(50, 40)) == pytest.approx(RADIUS, rel=0.05)
