@@ -19,7 +19,7 @@ from hoigs.core.interfaces.estimator import (
     PromptPoint,
     VideoRequest,
 )
-from hoigs.plugins.estimators.object_tracker.appearance import Appearance
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
 from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.footage import ColorModel, Footage, bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.path import (
@@ -104,21 +104,25 @@ def followed(
     first = tracked(footage, scene, prompts, looks=looks, progress=lambda x: progress(0.4 * x))
     proof = proof_of(footage, scene, prompts, first, looks, known)
     found = without_unproven(first, proof)
-    best = anchors(footage, found, prompts)
+    best, alike = anchors(footage, found, prompts), False
     enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
     if best and not enough:
+        # where others are like it in prompted frames, as shoes like a ball, any is as good
+        any_is = bool(twins_of(looks, known))
         known = masks_of([*prompts, *best])
         looks = Appearance.learnt(footage, known)
+        alike = not any_is and bool(twins_of(looks, known))
         again = tracked(
             footage, scene, prompts, best, looks, lambda x: progress(0.4 + 0.3 * x)
         )  # fmt: skip
         found = _joined(
             *(
-                without_unproven(t, proof_of(footage, scene, prompts, t, looks, known))
+                without_unproven(t, proof_of(footage, scene, prompts, t, looks, known, alike))
                 for t in (first, again)
             )
         )
-    found = completed(footage, scene, prompts, found)
+    if not alike:  # of which a part may be one
+        found = completed(footage, scene, prompts, found)
     behind = None
     if isinstance(scene, StaticScene):
         behind = Behind.of(footage, scene, found.soft > 127)
@@ -127,7 +131,8 @@ def followed(
     better = tracked_again(
         footage, behind, prompts, looks, found, lambda x: progress(0.7 + 0.3 * x)
     )
-    better = without_unproven(better, proof_of(footage, scene, prompts, better, looks, known))
+    proof = proof_of(footage, scene, prompts, better, looks, known, alike)
+    better = without_unproven(better, proof)
     return _mended(found, better)
 
 

@@ -36,11 +36,9 @@ from hoigs.plugins.estimators.object_tracker.prompts import (
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
 
-PROVEN = 0.5  # agreement from which a mask is proven by itself
-CARRIED = 0.3  # and from which it is by proven ones before and after it, without a gap
 SIZES = (0.3, 1.5)  # of its usual area about then: half hidden, and not with a thing beside it
 AROUND = 6  # proven frames before and after a frame that say what is usual
-AGAIN = (0.05, 0.7)  # more agreement for each frame without it before, and most that is asked for
+AGAIN = 0.05  # more agreement that is asked for after each frame without it
 STEP = 1.5  # diameters a frame beside what the motion foretells: farther is a jump
 SAME = 6.0  # units of colour within which a place looks as it did
 THERE = 0.7  # share of a mask that looks as it did while the object was elsewhere
@@ -48,6 +46,24 @@ NEAREST = 12  # frames that are believed and nearest in time, with which a frame
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
 MORE = 0.15  # how much more a mask on people has of their colours than the clicked one
 BANK = 4000  # cells of other things that are compared with
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Agreements that are asked for.
+
+    Attributes:
+        proven: by itself. carried: between proven frames, without a gap. again: at most, of a frame
+            before which it was not seen for long.
+    """
+
+    proven: float = 0.5
+    carried: float = 0.3
+    again: float = 0.7
+
+    def halved(self) -> Bounds:
+        """With half of the doubt that is left otherwise."""
+        return Bounds(*((1 + bound) / 2 for bound in (self.proven, self.carried, self.again)))
 
 
 @dataclass(frozen=True)
@@ -71,13 +87,16 @@ def proof_of(
     track: Track,
     looks: Appearance,
     known: Mapping[int, Bool[np.ndarray, "h w"]],
+    beside_alike: bool = False,
 ) -> Proof:
     """The frames whose mask shows what was prompted.
 
     Args:
         known: masks of the prompted frames, and perhaps of further ones that are proven. looks:
-            learnt from these.
+            learnt from these. beside_alike: looks take other things for the object, although they
+            were told that they are others.
     """
+    bounds = Bounds().halved() if beside_alike else Bounds()
     masks = track.soft > 127
     given = [p.frame for p in prompts]
     bank = _Bank.of(footage, looks, known)
@@ -86,7 +105,7 @@ def proof_of(
     most = max(OF_PERSON, MORE + max(of_person(footage, i, known[i]) for i in given))
     believed = {i: known[i] for i in given}
     for i in np.argsort(-agreement, kind="stable").tolist():
-        if i in believed or agreement[i] < CARRIED:
+        if i in believed or agreement[i] < bounds.carried:
             continue
         near = sorted(believed, key=lambda j: abs(i - j))[:NEAREST]
         if (
@@ -95,11 +114,11 @@ def proof_of(
             or lies_on_people(footage, i, masks[i], most)
         ):
             agreement[i] = 0.0
-        elif agreement[i] >= PROVEN:
+        elif agreement[i] >= bounds.proven:
             believed[i] = masks[i]
     area = masks.sum((1, 2)).astype(float)
-    agreement[~_usual_size(area, agreement >= PROVEN, given)] = 0.0
-    return Proof(agreement, _continued(masks, agreement, given))
+    agreement[~_usual_size(area, agreement >= bounds.proven, given)] = 0.0
+    return Proof(agreement, _continued(masks, agreement, given, bounds))
 
 
 @dataclass(frozen=True)
@@ -224,6 +243,7 @@ def _continued(
     masks: Bool[np.ndarray, "F h w"],
     agreement: Float[np.ndarray, " F"],
     given: list[int],
+    bounds: Bounds,
 ) -> Bool[np.ndarray, " F"]:
     """The proven frames, those that continue them, without those to which the object jumped.
 
@@ -241,7 +261,8 @@ def _continued(
     def follows(i: int, last: int, speed: Float[np.ndarray, "2"]) -> bool:
         gap, way = abs(i - last), place[i] - place[last]
         off = min(np.hypot(*(way - speed * gap)), np.hypot(*way))
-        least = CARRIED if gap == 1 else min(PROVEN + AGAIN[0] * (gap - 1), AGAIN[1])
+        again = min(bounds.proven + AGAIN * (gap - 1), bounds.again)
+        least = bounds.carried if gap == 1 else again
         return bool(agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap)
 
     for start in given:
@@ -259,7 +280,7 @@ def _continued(
                 moved = place[i] - place[last]
                 speed = 0.5 * (speed + moved) if abs(i - last) == 1 else np.zeros(2)
                 last, half = i, [*half, i]
-                if agreement[i] >= PROVEN:
+                if agreement[i] >= bounds.proven:
                     found[half] = True
                     proven, half = (last, speed), []
     return found

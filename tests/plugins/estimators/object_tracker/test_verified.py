@@ -27,7 +27,7 @@ from hoigs.plugins.estimators.object_tracker.states import (
     states_of,
 )
 from hoigs.plugins.estimators.object_tracker.verified import (
-    PROVEN,
+    Bounds,
     _as_before,
     _Bank,
     _continued,
@@ -90,25 +90,34 @@ def test_states_of_a_thing_behind_the_back_and_of_one_that_nobody_knows_of() -> 
 def test_a_frame_to_which_the_object_jumped_is_not_believed(places, believed) -> None:
     masks = np.stack([disc(*at) for at in places])
     agreement = np.array([1.0, 0.9, 0.9, 0.9])
-    found = _continued(masks, agreement, [0])
+    found = _continued(masks, agreement, [0], Bounds())
     assert found.astype(int).tolist() == believed
 
 
 def test_the_longer_it_was_not_seen_the_surer_it_must_be() -> None:
     masks = np.stack([disc(40, 40)] * 8)
     agreement = np.array([1.0, 0.4, 0.6, 0.1, 0.1, 0.6, 0.1, 0.8])
-    found = _continued(masks, agreement, [0])
+    found = _continued(masks, agreement, [0], Bounds())
     assert found.astype(int).tolist() == [1, 1, 1, 0, 0, 1, 0, 1]
     agreement[1:5] = 0.1
-    assert _continued(masks, agreement, [0]).astype(int).tolist() == [1, 0, 0, 0, 0, 0, 0, 1]
+    assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [
+        1,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+        1,
+    ]
 
 
 def test_half_proven_frames_count_only_on_the_way_to_a_proven_one() -> None:
     masks = np.stack([disc(40, 40)] * 6)
     agreement = np.array([1.0, 0.4, 0.4, 0.6, 0.4, 0.4])
-    assert _continued(masks, agreement, [0]).astype(int).tolist() == [1, 1, 1, 1, 0, 0]
+    assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [1, 1, 1, 1, 0, 0]
     agreement[2:4] = 0.1, 0.8
-    assert _continued(masks, agreement, [0]).astype(int).tolist() == [1, 0, 0, 1, 0, 0]
+    assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [1, 0, 0, 1, 0, 0]
 
 
 def test_cells_are_small_beside_the_thickness_of_a_flat_thing() -> None:
@@ -124,8 +133,8 @@ def test_cells_are_small_beside_the_thickness_of_a_flat_thing() -> None:
     known = {0: plate}
     bank = _Bank.of(footage, Appearance.learnt(footage, known), known)
     assert bank.side == 2
-    assert bank.nearer(1, at[1]) > PROVEN
-    assert bank.nearer(1, np.roll(plate, -20, 0)) < PROVEN
+    assert bank.nearer(1, at[1]) > Bounds().proven
+    assert bank.nearer(1, np.roll(plate, -20, 0)) < Bounds().proven
 
 
 def test_one_place_is_not_believed_in_two_frames_that_show_the_same_there() -> None:
