@@ -62,7 +62,7 @@ PLAN = {
         version=4,
     ),
     "object_masks": Stage(
-        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=7
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=8
     ),
     "cameras": Stage(
         3,

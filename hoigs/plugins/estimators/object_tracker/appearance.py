@@ -53,6 +53,13 @@ def _around(cells: Tensor, width: int) -> Tensor:
     return F.avg_pool2d(cells, width, 1, width // 2, count_include_pad=False)
 
 
+def half_breadth(mask: Bool[np.ndarray, "h w"]) -> float:
+    """Pixels from the middle of a mask to its rim along its shorter axis, by second moments: the
+    radius of a disc, and of a plate seen from its side half its thickness."""
+    at = np.argwhere(mask)
+    return 2 * float(np.sqrt(max(np.linalg.eigvalsh(np.cov(at.T))[0], 0))) if len(at) > 1 else 0.0
+
+
 def cell_shares(mask: np.ndarray, side: int) -> Float[np.ndarray, "r c"]:
     """The share of each cell that a mask covers."""
     rows, columns = mask.shape[0] // side, mask.shape[1] // side
@@ -156,6 +163,15 @@ def twins_of(
             reach = max(4, int(0.15 * np.sqrt(mask.sum())))
             found[i] = ndimage.binary_dilation(twins, iterations=reach) & ~mask
     return found
+
+
+def learnt_beside_twins(
+    footage: Footage, known: Mapping[int, Bool[np.ndarray, "h w"]]
+) -> tuple[Appearance, dict[int, Bool[np.ndarray, "h w"]]]:
+    """Looks, and the `twins_of` the object in known frames, from which nothing was learnt."""
+    looks = Appearance.learnt(footage, known)
+    twins = twins_of(looks, known)
+    return Appearance.learnt(footage, known, twins) if twins else looks, twins
 
 
 def _pictures(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -24,6 +23,7 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.threads import one_thread
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage, skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
@@ -51,7 +51,7 @@ from hoigs.plugins.estimators.object_tracker.tracker import (
     at_rest,
     color_model,
     followed,
-    learnt,
+    masks_of,
     read_tracks,
     write_tracks,
 )
@@ -113,7 +113,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 22  # of what is kept in `work`; raised when masks change
+VERSION = 23  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -198,8 +198,10 @@ class ObjectTrackerEstimator(Estimator):
         chosen: dict[str, list[FramePrompt]] = {}
         for entity in (e for e in wanted if e.prompts):
             prompts[entity.name] = self._prompted(entity, footage, scene, notes)
-        known = {n: learnt(footage, masks) for n, masks in prompts.items() if masks}
-        groups = groups_of(prompts, {n: k for n, (_, k) in known.items()})
+        looks = {n: Appearance.learnt(footage, masks_of(m)) for n, m in prompts.items() if m}
+        groups = groups_of(
+            prompts, {n: twins_of(k, masks_of(prompts[n])) for n, k in looks.items()}
+        )
         equal = {n for _, group in groups for n in group}
         done = 0.35
         for frame, group in groups:
@@ -216,7 +218,7 @@ class ObjectTrackerEstimator(Estimator):
             masks, share = prompts[entity.name], 0.65 / len(wanted)
             part = _part(progress, done, share)
             tracks[entity.name] = (
-                followed(footage, scene, masks, part, known.get(entity.name)) if masks else None
+                followed(footage, scene, masks, part, looks.get(entity.name)) if masks else None
             )
             done += share
         others = {n: [] if n in equal else masks for n, masks in prompts.items()}
@@ -281,7 +283,7 @@ def _proposed(
             f"{best.frame} was taken; if it is something else, click on it, such as --object "
             "640,402@0"
         )
-    return [replace(p.mask, proposed=True) for p in found], [p.prompt for p in found]
+    return [p.mask for p in found], [p.prompt for p in found]
 
 
 def _part(progress: Progress, start: float, share: float) -> Callable[[float], None]:

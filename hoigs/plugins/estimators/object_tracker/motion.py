@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 
-BESIDE = 2  # frames before and after, if the footage has them
+BESIDE, FARTHEST = 2, 6  # frames before and after: of these the nearest that the footage has
 REACH = 9  # quarters of its pixels that a pixel may move between: 36 pixels
 LARGEST = 40.0  # difference of colours from which pixels differ entirely
 SAME = (1.4, 2.0)  # a motion explains a pixel up to so much of its own best cost, and more
@@ -36,9 +36,11 @@ class Motion:
     def of(cls, footage: Footage, i: int) -> Motion:
         """None of the frames beside it where the footage does not have them."""
         here, number, beside = _halved(footage.colors(i)), footage.numbers[i], []
-        for other in (number - BESIDE, number + BESIDE):
-            if other in footage.numbers:
-                there = _halved(footage.colors(footage.numbers.index(other)))
+        for way in (-1, 1):
+            apart = [(way * (n - number), k) for k, n in enumerate(footage.numbers)]
+            near = min((a for a in apart if BESIDE <= a[0] <= FARTHEST), default=None)
+            if near is not None:
+                there = _halved(footage.colors(near[1]))
                 shift = _shifts(here, there)
                 beside.append((there, shift, _costs(here, there, shift, 3)))
         return cls(here, beside)

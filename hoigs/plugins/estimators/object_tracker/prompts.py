@@ -79,7 +79,7 @@ class PromptedMask:
     Attributes:
         soft: probability of each pixel of the frame. quality: how well it is set off, 0 to 1.
         on_person: the click lies on the person's mask.
-        barred: pixels that the prompt rules out. proposed: nobody marked it.
+        barred: pixels that the prompt rules out.
     """
 
     frame: int
@@ -87,7 +87,6 @@ class PromptedMask:
     quality: float
     on_person: bool
     barred: Bool[np.ndarray, "h w"]
-    proposed: bool = False
 
 
 def prompted_mask(

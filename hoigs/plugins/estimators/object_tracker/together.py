@@ -16,32 +16,38 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
+from hoigs.plugins.estimators.object_tracker.appearance import learnt_beside_twins
 from hoigs.plugins.estimators.object_tracker.footage import Footage, Window
 from hoigs.plugins.estimators.object_tracker.path import Evidence, center_of, object_odds
 from hoigs.plugins.estimators.object_tracker.places import Place, Shape, places_of
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, walked
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.tracker import color_model, learnt
-from hoigs.plugins.estimators.object_tracker.verified import Known
+from hoigs.plugins.estimators.object_tracker.tracker import color_model, masks_of
+
+Twins = Mapping[int, Bool[np.ndarray, "h w"]]  # by frame
 
 
 def groups_of(
-    prompts: Mapping[str, Sequence[PromptedMask]], known: Mapping[str, Known]
+    prompts: Mapping[str, Sequence[PromptedMask]], twins: Mapping[str, Twins]
 ) -> list[tuple[int, list[str]]]:
     """Objects that were clicked in one frame and look alike, and that frame; one object alone where
-    what looks like it was not clicked."""
-    masks = {n: _by_frame(found) for n, found in prompts.items()}
+    what looks like it was not clicked.
+
+    Args:
+        twins: of each clicked object, the pixels of what looks like it (`twins_of`).
+    """
+    masks = {n: masks_of(found) for n, found in prompts.items()}
 
     def alike(a: str, b: str, frame: int) -> bool:
-        twins = known[a].twins.get(frame)
-        return twins is not None and bool(twins[masks[b][frame]].mean() > 0.5)
+        like = twins[a].get(frame)
+        return like is not None and bool(like[masks[b][frame]].mean() > 0.5)
 
     groups: list[tuple[int, list[str]]] = []
-    for name in (n for n in known if known[n].twins):
+    for name in (n for n in twins if twins[n]):
         if any(name in group for _, group in groups):
             continue
-        frame = min(known[name].twins)
-        clicked = [n for n in known if frame in masks[n] and not any(n in g for _, g in groups)]
+        frame = min(twins[name])
+        clicked = [n for n in twins if frame in masks[n] and not any(n in g for _, g in groups)]
         group = [name]
         for member in group:  # which grows
             group += [
@@ -248,7 +254,7 @@ def followed_together(
     What looks like them there and was not clicked is followed, too, so that none of them becomes
     it. Frames in which it is not sure which is which have an empty mask.
     """
-    evidence, masks = _evidence(footage, prompts), [_by_frame(f) for f in prompts.values()]
+    evidence, masks = _evidence(footage, prompts), [masks_of(f) for f in prompts.values()]
     clicked = [p for found in prompts.values() for p in found if p.frame == first]
     shape = Shape.of(max(clicked, key=lambda p: p.quality).soft > 0.5)
     places, count = [], len(footage)
@@ -292,18 +298,13 @@ def followed_together(
     return tracks
 
 
-def _by_frame(prompts: Sequence[PromptedMask]) -> dict[int, Bool[np.ndarray, "h w"]]:
-    return {p.frame: p.soft > 0.5 for p in prompts}
-
-
 def _evidence(footage: Footage, prompts: Mapping[str, Sequence[PromptedMask]]) -> Evidence:
     """What speaks for any of the objects, learnt from all of them."""
     every = [p for found in prompts.values() for p in found]
     frames = sorted({p.frame for p in every})
     soft = {i: np.max([p.soft for p in every if p.frame == i], 0) for i in frames}
-    some = {p.frame: p for p in every}
-    looks, known = learnt(footage, [replace(some[i], soft=soft[i]) for i in frames])
-    return Evidence(footage, None, color_model(footage, soft, known.twins), looks)
+    looks, twins = learnt_beside_twins(footage, {i: soft[i] > 0.5 for i in frames})
+    return Evidence(footage, None, color_model(footage, soft, twins), looks)
 
 
 def _rests(footage: Footage, mask: Bool[np.ndarray, "h w"], i: int, last: int) -> bool:

@@ -33,7 +33,7 @@ from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Tra
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 from hoigs.plugins.estimators.object_tracker.states import LOST
 from hoigs.plugins.estimators.object_tracker.unexplained import completed
-from hoigs.plugins.estimators.object_tracker.verified import Known, proof_of, without_unproven
+from hoigs.plugins.estimators.object_tracker.verified import proof_of, without_unproven
 
 # Frames in which an object was found best, from which it is followed again.
 #
@@ -89,37 +89,40 @@ def followed(
     scene: Scene,
     prompts: Sequence[PromptedMask],
     progress: Callable[[float], None] = lambda share: None,
-    known_by: tuple[Appearance, Known] | None = None,
+    looks: Appearance | None = None,
 ) -> Track:
     """Masks of the frames that are proven to show the object; those of the others are empty.
 
     In up to three passes: the second knows what the object looks like in the frames in which the
     first found it best, the third what is behind an object that hides a person who keeps still.
 
-    Of equal things a user who marked one means that one, and one break in its way ends what is
-    known of it. Of what was only proposed any is as good: white shoes do not end the way of a ball.
-
     Args:
-        known_by: what `learnt` says of the prompts; None: not yet.
+        looks: learnt from the prompts; None: not yet.
     """
-    looks, known = known_by or learnt(footage, prompts)
+    known = masks_of(prompts)
+    looks = looks or Appearance.learnt(footage, known)
     first = tracked(footage, scene, prompts, looks=looks, progress=lambda x: progress(0.4 * x))
     proof = proof_of(footage, scene, prompts, first, looks, known)
     found = without_unproven(first, proof)
-    best = anchors(footage, found, prompts)
+    best, alike = anchors(footage, found, prompts), False
     enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
-    if best and not enough and not known.twins:  # which no looks tell apart
-        looks, known = learnt(footage, [*prompts, *best])
+    if best and not enough:
+        # where others are like it in prompted frames, as shoes like a ball, any is as good
+        any_is = bool(twins_of(looks, known))
+        known = masks_of([*prompts, *best])
+        looks = Appearance.learnt(footage, known)
+        alike = not any_is and bool(twins_of(looks, known))
         again = tracked(
             footage, scene, prompts, best, looks, lambda x: progress(0.4 + 0.3 * x)
         )  # fmt: skip
         found = _joined(
             *(
-                without_unproven(t, proof_of(footage, scene, prompts, t, looks, known))
+                without_unproven(t, proof_of(footage, scene, prompts, t, looks, known, alike))
                 for t in (first, again)
             )
         )
-    found = completed(footage, scene, prompts, found, unlike=not known.twins)
+    if not alike:  # of which a part may be one
+        found = completed(footage, scene, prompts, found)
     behind = None
     if isinstance(scene, StaticScene):
         behind = Behind.of(footage, scene, found.soft > 127)
@@ -128,7 +131,8 @@ def followed(
     better = tracked_again(
         footage, behind, prompts, looks, found, lambda x: progress(0.7 + 0.3 * x)
     )
-    better = without_unproven(better, proof_of(footage, scene, prompts, better, looks, known))
+    proof = proof_of(footage, scene, prompts, better, looks, known, alike)
+    better = without_unproven(better, proof)
     return _mended(found, better)
 
 
@@ -143,12 +147,9 @@ def _mended(found: Track, better: Track) -> Track:
     )
 
 
-def learnt(footage: Footage, known: Sequence[PromptedMask]) -> tuple[Appearance, Known]:
-    """What the object looks like in known frames, and these without others that look like it."""
-    masks = {p.frame: p.soft > 0.5 for p in known}
-    looks = Appearance.learnt(footage, masks)
-    twins = {} if any(p.proposed for p in known) else twins_of(looks, masks)
-    return Appearance.learnt(footage, masks, twins) if twins else looks, Known(masks, twins)
+def masks_of(prompts: Sequence[PromptedMask]) -> dict[int, Bool[np.ndarray, "h w"]]:
+    """The object's masks in prompted frames."""
+    return {p.frame: p.soft > 0.5 for p in prompts}
 
 
 def tracked(
@@ -164,14 +165,14 @@ def tracked(
     Args:
         looks: learnt from these; None: not yet.
     """
-    rests = at_rest(scene, {p.frame: p.soft > 0.5 for p in prompts})
+    rests = at_rest(scene, masks_of(prompts))
     prompts = [*prompts, *further]
-    known = {p.frame: p.soft > 0.5 for p in prompts}
+    known = masks_of(prompts)
     colors = color_model(footage, {p.frame: p.soft for p in prompts})
     moving = isinstance(scene, MovingScene)
     # what rests is a part of a still camera's scene; a moving one's is that of nearby frames
     used = scene if moving or not rests else None
-    evidence = Evidence(footage, used, colors, looks or learnt(footage, prompts)[0])
+    evidence = Evidence(footage, used, colors, looks or Appearance.learnt(footage, known))
     path = found_path(evidence, known, progress=lambda x: progress(0.3 * x))
     stands = not rests and stands_out(footage, used, path, known)
     unchanged = 1.2 if stands else 0.1

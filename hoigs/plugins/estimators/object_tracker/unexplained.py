@@ -93,17 +93,9 @@ def length_of(mask: Bool[np.ndarray, "h w"]) -> float:
 
 
 def completed(
-    footage: Footage,
-    scene: Scene,
-    prompts: Sequence[PromptedMask],
-    track: Track,
-    unlike: bool = True,
+    footage: Footage, scene: Scene, prompts: Sequence[PromptedMask], track: Track
 ) -> Track:
-    """The track, and where it has no mask before a still camera the part that is the object.
-
-    Args:
-        unlike: nothing else looks like it; else the first frame without it ends its way.
-    """
+    """The track, and where it has no mask before a still camera the part that is the object."""
     missed = ~(track.soft > 127).any((1, 2))
     if not missed.any() or not isinstance(scene, StaticScene):
         return track
@@ -112,7 +104,7 @@ def completed(
         others = {p.frame for p in prompts if p is not prompt}
         for step in (1, -1):
             frames = _until(prompt.frame, step, others, len(footage))
-            _walk(footage, scene, prompt, frames, track, unlike)
+            _walk(footage, scene, prompt, frames, track)
     return track
 
 
@@ -130,7 +122,6 @@ def _walk(
     prompt: PromptedMask,
     frames: Iterator[int],
     track: Track,
-    unlike: bool,
 ) -> None:
     """Fills in what is missing of a track, from a prompted frame outwards."""
     found = _clicked(footage, scene, prompt)
@@ -155,8 +146,6 @@ def _walk(
         if part is not None:
             colors = (1 - LEARNT) * known.colors + LEARNT * part.colors
             known, last = replace(part, colors=colors), i
-        elif not unlike:
-            return
 
 
 def _clicked(

@@ -8,7 +8,7 @@ elsewhere, and where it did not jump. All other masks are dropped: none is bette
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +18,14 @@ from scipy import ndimage
 from torch import Tensor
 
 from hoigs.plugins.estimators.object_tracker.appearance import (
+    CELLS,
     FREE,
     Appearance,
     cell_features,
     cell_shares,
+    half_breadth,
 )
-from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 from hoigs.plugins.estimators.object_tracker.path import center_of
 from hoigs.plugins.estimators.object_tracker.prompts import (
     OF_PERSON,
@@ -34,31 +36,34 @@ from hoigs.plugins.estimators.object_tracker.prompts import (
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
 
-PROVEN = 0.5  # agreement from which a mask is proven by itself
-CARRIED = 0.3  # and from which it is by the frames beside it, from which it does not differ much
 SIZES = (0.3, 1.5)  # of its usual area about then: half hidden, and not with a thing beside it
 AROUND = 6  # proven frames before and after a frame that say what is usual
+AGAIN = 0.05  # more agreement that is asked for after each frame without it
 STEP = 1.5  # diameters a frame beside what the motion foretells: farther is a jump
-# of an object that has twins: how far beside its way it may be, in breadths; its area, of that
-# before; in distances of the nearest other; and frames that may be missed
-BESIDE, ALONE, CLEARLY, MISSED = 0.6, (0.6, 1.4), 0.5, 8
 SAME = 6.0  # units of colour within which a place looks as it did
 THERE = 0.7  # share of a mask that looks as it did while the object was elsewhere
+NEAREST = 12  # frames that are believed and nearest in time, with which a frame is compared
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
 MORE = 0.15  # how much more a mask on people has of their colours than the clicked one
 BANK = 4000  # cells of other things that are compared with
 
 
 @dataclass(frozen=True)
-class Known:
-    """Masks of the object in some frames, and pixels of these that look like it and are not."""
+class Bounds:
+    """Agreements that are asked for.
 
-    masks: Mapping[int, Bool[np.ndarray, "h w"]]
-    twins: Mapping[int, Bool[np.ndarray, "h w"]]
+    Attributes:
+        proven: by itself. carried: between proven frames, without a gap. again: at most, of a frame
+            before which it was not seen for long.
+    """
 
-    def others(self, i: int) -> Bool[np.ndarray, "h w"]:
-        """Pixels of a frame that show something else, and do not look like the object."""
-        return ~(self.masks[i] | self.twins.get(i, False))
+    proven: float = 0.5
+    carried: float = 0.3
+    again: float = 0.7
+
+    def halved(self) -> Bounds:
+        """With half of the doubt that is left otherwise."""
+        return Bounds(*((1 + bound) / 2 for bound in (self.proven, self.carried, self.again)))
 
 
 @dataclass(frozen=True)
@@ -81,120 +86,143 @@ def proof_of(
     prompts: Sequence[PromptedMask],
     track: Track,
     looks: Appearance,
-    known: Known,
+    known: Mapping[int, Bool[np.ndarray, "h w"]],
+    beside_alike: bool = False,
 ) -> Proof:
     """The frames whose mask shows what was prompted.
 
     Args:
-        looks: learnt from the `known` masks: those of the prompted frames, and perhaps of further
-            ones that are proven.
+        known: masks of the prompted frames, and perhaps of further ones that are proven. looks:
+            learnt from these. beside_alike: looks take other things for the object, although they
+            were told that they are others.
     """
+    bounds = Bounds().halved() if beside_alike else Bounds()
     masks = track.soft > 127
     given = [p.frame for p in prompts]
     bank = _Bank.of(footage, looks, known)
     agreement = np.array([_agreement(bank, looks, i, m) for i, m in enumerate(masks)])
     agreement[given] = 1.0
-    most = max(OF_PERSON, MORE + max(of_person(footage, i, known.masks[i]) for i in given))
-    for i in np.flatnonzero(agreement >= CARRIED).tolist():
-        if i not in given and (
-            _was_there(footage, scene, known, given, i, masks[i])
+    most = max(OF_PERSON, MORE + max(of_person(footage, i, known[i]) for i in given))
+    believed = {i: known[i] for i in given}
+    for i in np.argsort(-agreement, kind="stable").tolist():
+        if i in believed or agreement[i] < bounds.carried:
+            continue
+        near = sorted(believed, key=lambda j: abs(i - j))[:NEAREST]
+        if (
+            any(_as_before(footage, scene, i, masks[i], j, believed[j]) for j in [*given, *near])
+            or any(_uncovered(footage, scene, i, masks[i], j, known[j]) for j in given)
             or lies_on_people(footage, i, masks[i], most)
         ):
             agreement[i] = 0.0
+        elif agreement[i] >= bounds.proven:
+            believed[i] = masks[i]
     area = masks.sum((1, 2)).astype(float)
-    agreement[~_usual_size(area, agreement >= PROVEN, given)] = 0.0
-    proven = agreement >= PROVEN
-    if not known.twins:
-        return Proof(agreement, _continued(masks, agreement, proven, given))
-
-    def alike(i: int) -> Float[np.ndarray, "N 2"]:
-        return _middles_of_alike(looks, i, masks[i], masks[given[0]].sum())
-
-    return Proof(agreement, _followed(masks, agreement, alike, given))
-
-
-def _middles_of_alike(
-    looks: Appearance, i: int, mask: Bool[np.ndarray, "h w"], usual: float
-) -> Float[np.ndarray, "N 2"]:
-    """Middles x, y of what looks like the object beside its mask, and is no small part of one."""
-    own = ndimage.binary_dilation(mask, iterations=2 * looks.side)
-    labels, count = ndimage.label((looks.odds(i) > 0) & ~own)
-    rows = np.arange(1, count + 1)
-    large = rows[ndimage.sum_labels(np.ones(mask.shape), labels, rows) > SIZES[0] * usual]
-    middles = ndimage.center_of_mass(labels > 0, labels, large)
-    return np.array(middles).reshape(-1, 2)[:, ::-1] + 0.5
+    agreement[~_usual_size(area, agreement >= bounds.proven, given)] = 0.0
+    return Proof(agreement, _continued(masks, agreement, given, bounds))
 
 
 @dataclass(frozen=True)
 class _Bank:
-    """Features of known cells: the object's, and those of all else."""
+    """Features of known cells: the object's, and those of all else.
 
+    A cell's features are also those of what is around it. For the cells of a flat thing that is
+    what it is in front of, which changes, if they are not small beside its shorter axis.
+
+    Attributes:
+        side: of a cell, pixels. mean, spread: of the features.
+    """
+
+    footage: Footage
+    side: int
+    mean: Float[Tensor, "C"]
+    spread: Float[Tensor, "C"]
     inside: Float[Tensor, "N C"]
     outside: Float[Tensor, "M C"]
 
     @classmethod
-    def of(cls, footage: Footage, looks: Appearance, known: Known) -> _Bank:
+    def of(
+        cls, footage: Footage, looks: Appearance, known: Mapping[int, Bool[np.ndarray, "h w"]]
+    ) -> _Bank:
+        half = float(np.mean([half_breadth(mask) for mask in known.values()]))
+        side = min(looks.side, max(1, round(half / CELLS)))
         inside, outside = [], []
-        for i, mask in known.masks.items():
-            cells = looks.scaled(cell_features(footage.colors(i), looks.side))
-            share = torch.from_numpy(cell_shares(mask, looks.side).ravel())
+        frames = {i: cell_features(footage.colors(i), side).flatten(1).T for i in known}
+        every = torch.cat(list(frames.values()))
+        mean, spread = every.mean(0), every.std(0) + 1e-3
+        for i, mask in known.items():
+            cells = (frames[i] - mean) / spread
+            share = torch.from_numpy(cell_shares(mask, side).ravel())
             inside.append(cells[share > 0.5])
-            free = torch.from_numpy(cell_shares(known.others(i), looks.side).ravel())
+            free = torch.from_numpy(cell_shares(~mask, side).ravel())
             rest = cells[free > 1 - FREE]
-            outside.append(rest[:: max(1, len(known.masks) * len(rest) // BANK)])
-        return cls(torch.cat(inside), torch.cat(outside))
+            outside.append(rest[:: max(1, len(known) * len(rest) // BANK)])
+        return cls(footage, side, mean, spread, torch.cat(inside), torch.cat(outside))
 
-    def nearer(self, cells: Float[Tensor, "K C"]) -> float:
-        """The share of cells that are nearer to one of the object's."""
-        if not len(self.inside) or not len(self.outside):
+    def nearer(self, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
+        """The share of a mask's cells that are nearer to one of the object's."""
+        own = _cells_of(mask, self.side)
+        if not own.any() or not len(self.inside) or not len(self.outside):
             return 0.0
+        every = cell_features(self.footage.colors(i), self.side).flatten(1).T
+        cells = (every[torch.from_numpy(own.ravel())] - self.mean) / self.spread
         near, far = (torch.cdist(cells, b).min(1).values for b in (self.inside, self.outside))
         return float((near < far).float().mean())
 
 
+def _cells_of(mask: Bool[np.ndarray, "h w"], side: int) -> Bool[np.ndarray, "r c"]:
+    """The cells that are a mask's; those it has most of where it has none alone."""
+    share = cell_shares(mask, side)
+    return share > min(0.6, 0.9 * share.max())
+
+
 def _agreement(bank: _Bank, looks: Appearance, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
-    share = cell_shares(mask, looks.side)
-    inside = share > min(0.6, 0.9 * share.max())
-    if not mask.any() or not inside.any():
+    own = _cells_of(mask, looks.side)
+    if not own.any():
         return 0.0
-    odds = looks.cells(i)[inside]
-    cells = looks.scaled(cell_features(looks.footage.colors(i), looks.side))
-    alike = float((1 / (1 + np.exp(-odds))).mean())
-    return min(alike, bank.nearer(cells[torch.from_numpy(inside.ravel())]))
+    alike = float((1 / (1 + np.exp(-looks.cells(i)[own]))).mean())
+    return min(alike, bank.nearer(i, mask))
 
 
-def _was_there(
+def _as_before(
     footage: Footage,
     scene: Scene,
-    known: Known,
-    given: Sequence[int],
     i: int,
     mask: Bool[np.ndarray, "h w"],
+    other: int,
+    known: Bool[np.ndarray, "h w"],
 ) -> bool:
-    """Whether a place looks as it did in a frame in which the object is known to be elsewhere, or
-    as the still scene does, from which the object differed when it was there."""
+    """Whether a place of frame `i` looks as it does in another one, in which the object is
+    elsewhere: it shows something else in both."""
     y, x = np.nonzero(mask)
-    here = footage.colors(i)[y, x]
-    for frame in given:
-        to = np.floor(carried(scene, np.stack((x, y), -1) + 0.5, i, frame)).astype(int)
-        inside = ((to >= 0) & (to < np.array(footage.shape[::-1]))).all(1)
-        row, column = to[inside].T[::-1]
-        elsewhere = (known.others(frame) & ~footage.blank[frame])[row, column]
-        if not len(row):
-            continue
-        if elsewhere.mean() >= THERE:
-            away = np.abs(here[inside] - footage.colors(frame)[row, column]).max(1)
-            if (away[elsewhere] < SAME).mean() > THERE:
-                return True
-        same_place = ndimage.binary_dilation(known.masks[frame], iterations=2 * footage.unit)
-        if isinstance(scene, StaticScene) and same_place[mask].mean() >= THERE:
-            now, then = (scene.difference(k)[mask] for k in (i, frame))
-            told = np.isfinite(now) & np.isfinite(then)
-            if told.mean() > FEW:
-                now, then = (np.minimum(v[told], 10).mean() for v in (now, then))
-                if now < FADED * then:
-                    return True
-    return False
+    to = np.floor(carried(scene, np.stack((x, y), -1) + 0.5, i, other)).astype(int)
+    inside = ((to >= 0) & (to < np.array(footage.shape[::-1]))).all(1)
+    row, column = to[inside].T[::-1]
+    elsewhere = (~known & ~footage.blank[other])[row, column]
+    if not len(row) or elsewhere.mean() < THERE:
+        return False
+    here, there = footage.lab[i][y[inside], x[inside]], footage.lab[other][row, column]
+    away = np.abs(to_features(here[elsewhere]) - to_features(there[elsewhere])).max(1)
+    return bool((away < SAME).mean() > THERE)
+
+
+def _uncovered(
+    footage: Footage,
+    scene: Scene,
+    i: int,
+    mask: Bool[np.ndarray, "h w"],
+    prompted: int,
+    known: Bool[np.ndarray, "h w"],
+) -> bool:
+    """Whether a place shows the still scene, from which it differed when the object was there."""
+    same_place = ndimage.binary_dilation(known, iterations=2 * footage.unit)
+    if not isinstance(scene, StaticScene) or same_place[mask].mean() < THERE:
+        return False
+    now, then = (scene.difference(k)[mask] for k in (i, prompted))
+    told = np.isfinite(now) & np.isfinite(then)
+    if not told.mean() > FEW:
+        return False
+    now, then = (np.minimum(v[told], 10).mean() for v in (now, then))
+    return bool(now < FADED * then)
 
 
 def _usual_size(
@@ -214,87 +242,47 @@ def _usual_size(
 def _continued(
     masks: Bool[np.ndarray, "F h w"],
     agreement: Float[np.ndarray, " F"],
-    proven: Bool[np.ndarray, " F"],
     given: list[int],
+    bounds: Bounds,
 ) -> Bool[np.ndarray, " F"]:
     """The proven frames, those that continue them, without those to which the object jumped.
 
     From each prompted frame outwards: a frame follows the last one that was believed if the object
     moved no farther than its motion so far foretells, or if enough frames were missed for it to
-    have come there; one that is half proven follows only the frame beside it.
+    have come there. Half proven ones are believed where they lead from a proven frame to another
+    without a gap: a mask that drifts off the object never comes to one. The longer the object was
+    not seen, the surer it must be: what is where it was looks like it more often than not.
     """
     found = np.zeros(len(masks), bool)
     found[given] = True
     place = np.array([center_of(m) if m.any() else (np.nan, np.nan) for m in masks])
     size = 2 * np.sqrt(masks.sum((1, 2)) / np.pi)
+
+    def follows(i: int, last: int, speed: Float[np.ndarray, "2"]) -> bool:
+        gap, way = abs(i - last), place[i] - place[last]
+        off = min(np.hypot(*(way - speed * gap)), np.hypot(*way))
+        again = min(bounds.proven + AGAIN * (gap - 1), bounds.again)
+        least = bounds.carried if gap == 1 else again
+        return bool(agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap)
+
     for start in given:
         for step in (1, -1):
-            last, speed = start, np.zeros(2)
+            last, speed, half = start, np.zeros(2), list[int]()
+            proven = (last, speed)
             for i in range(start + step, len(masks) if step > 0 else -1, step):
                 if i in given:
+                    found[half] = True
                     break
-                gap = abs(i - last)
-                off = np.hypot(*(place[i] - place[last] - speed * gap))
-                off = min(off, np.hypot(*(place[i] - place[last])))
-                reach = STEP * max(size[i], size[last]) * gap
-                enough = proven[i] or (gap == 1 and agreement[i] >= CARRIED)
-                if not enough or not off <= reach:
+                if half and not follows(i, last, speed):
+                    (last, speed), half = proven, []
+                if not follows(i, last, speed):
                     continue
                 moved = place[i] - place[last]
-                speed = 0.5 * (speed + moved) if gap == 1 else np.zeros(2)
-                found[i], last = True, i
-    return found
-
-
-def _followed(
-    masks: Bool[np.ndarray, "F h w"],
-    agreement: Float[np.ndarray, " F"],
-    alike: Callable[[int], Float[np.ndarray, "N 2"]],
-    given: list[int],
-) -> Bool[np.ndarray, " F"]:
-    """Of an object that has twins: the frames in which its way tells which of them is seen.
-
-    Looks do not tell. A mask is the object's where it lies on its way, and clearly nearer to that
-    than any other thing that looks alike. A few frames may be missed, as a hand may cover it; once
-    another thing comes to where it was last seen meanwhile, or too many are missed, nothing tells
-    any more which is which.
-
-    Args:
-        alike: of a frame, the middles x, y of things beside its mask that look like the object.
-    """
-    found = np.zeros(len(masks), bool)
-    found[given] = True
-    area = masks.sum((1, 2)).astype(float)
-    for start in given:
-        for step in (1, -1):
-            at, speed, usual, last = (
-                np.array(center_of(masks[start])),
-                np.zeros(2),
-                area[start],
-                start,
-            )
-            for i in range(start + step, len(masks) if step > 0 else -1, step):
-                gap = abs(i - last)
-                if i in given or gap > MISSED:
-                    break
-                breadth = np.sqrt(usual)
-                fits = agreement[i] >= CARRIED and ALONE[0] < area[i] / usual < ALONE[1]
-                foretold = at + speed if gap == 1 else at  # nothing goes on evenly behind a hand
-                others = np.hypot(*(alike(i) - foretold).T).min(initial=np.inf)
-                if fits:
-                    moved = np.array(center_of(masks[i])) - at
-                    off = np.hypot(*(moved + at - foretold))
-                    if off <= min(BESIDE * breadth, CLEARLY * others):
-                        at, speed, last = (
-                            at + moved,
-                            0.5 * (speed + moved) if gap == 1 else 0 * at,
-                            i,
-                        )
-                        usual = 0.9 * usual + 0.1 * area[i]
-                        found[i] = True
-                        continue
-                if others < breadth or area[i] >= ALONE[1] * usual:
-                    break  # another thing is there, or was taken in
+                speed = 0.5 * (speed + moved) if abs(i - last) == 1 else np.zeros(2)
+                last, half = i, [*half, i]
+                if agreement[i] >= bounds.proven:
+                    found[half] = True
+                    proven, half = (last, speed), []
     return found
 
 

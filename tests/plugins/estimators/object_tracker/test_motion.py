@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from disc_world import H, W, texture
@@ -38,6 +40,12 @@ def test_one_motion_sets_a_disc_off_from_a_wall_of_its_colours() -> None:
     ).T
     assert shares[0] > 0.5 and shares[0] > shares[1:].max() + 0.2
     assert differences[0] > differences[1:].max() + 0.3
+
+
+def test_motion_is_known_of_every_third_frame_and_not_of_every_tenth() -> None:
+    third, tenth = (replace(footage(), numbers=tuple(range(0, 5 * n, n))) for n in (3, 10))
+    assert Motion.of(third, 2).sets_off(disc(50))[0] > 0.5
+    assert not Motion.of(tenth, 2).sets_off(disc(50)).any()
 
 
 def test_a_frame_alone_says_nothing_of_motion() -> None:

@@ -21,7 +21,6 @@ from hoigs.plugins.estimators.object_tracker.together import (
     groups_of,
     lasting,
 )
-from hoigs.plugins.estimators.object_tracker.verified import Known
 
 Y, X = np.mgrid[:H, :W] + 0.5
 NOBODY = np.zeros((H, W), bool)
@@ -116,10 +115,10 @@ def test_groups_are_of_what_was_clicked_in_one_frame_and_looks_alike() -> None:
 
     a, b, c = disc(20, 20), disc(60, 20), disc(90, 60)
     prompts = {"a": [prompted(a, 0)], "b": [prompted(b, 0)], "c": [prompted(c, 0)]}
-    known = {"a": Known({0: a}, {0: b}), "b": Known({0: b}, {}), "c": Known({0: c}, {})}
-    assert groups_of(prompts, known) == [(0, ["a", "b"])]
-    known["b"], known["c"] = Known({0: b}, {0: a}), Known({0: c}, {0: a | b})
-    assert groups_of(prompts, known) == [(0, ["a", "b", "c"])]
+    twins: dict[str, dict[int, np.ndarray]] = {"a": {0: b}, "b": {}, "c": {}}
+    assert groups_of(prompts, twins) == [(0, ["a", "b"])]
+    twins |= {"b": {0: a}, "c": {0: a | b}}
+    assert groups_of(prompts, twins) == [(0, ["a", "b", "c"])]
 
 
 def test_two_equal_discs_that_cross_keep_their_names(tmp_path: Path) -> None:

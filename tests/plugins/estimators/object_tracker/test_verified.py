@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +10,9 @@ from disc_world import COUNT, RADIUS, H, W, click, masks_of, overlaps, request, 
 from test_behind import footage_of
 
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance, half_breadth
 from hoigs.plugins.estimators.object_tracker.prompts import (
-    PromptedMask,
+    lies_on_people,
     of_person,
     prompted_mask,
 )
@@ -27,14 +26,13 @@ from hoigs.plugins.estimators.object_tracker.states import (
     SEEN,
     states_of,
 )
-from hoigs.plugins.estimators.object_tracker.tracker import learnt
 from hoigs.plugins.estimators.object_tracker.verified import (
-    Known,
+    Bounds,
+    _as_before,
+    _Bank,
     _continued,
-    _followed,
+    _uncovered,
     _usual_size,
-    _was_there,
-    lies_on_people,
 )
 
 Y, X = np.mgrid[:H, :W] + 0.5
@@ -92,25 +90,66 @@ def test_states_of_a_thing_behind_the_back_and_of_one_that_nobody_knows_of() -> 
 def test_a_frame_to_which_the_object_jumped_is_not_believed(places, believed) -> None:
     masks = np.stack([disc(*at) for at in places])
     agreement = np.array([1.0, 0.9, 0.9, 0.9])
-    found = _continued(masks, agreement, agreement > 0.5, [0])
+    found = _continued(masks, agreement, [0], Bounds())
     assert found.astype(int).tolist() == believed
 
 
-def test_of_equal_things_the_one_on_its_way_is_believed() -> None:
-    masks = np.stack([disc(20 + 4 * i, 40) for i in range(8)])
-    sure, hidden = np.full(8, 0.9), np.full(8, 0.9)
-    hidden[4] = 0.1
+def test_the_longer_it_was_not_seen_the_surer_it_must_be() -> None:
+    masks = np.stack([disc(40, 40)] * 8)
+    agreement = np.array([1.0, 0.4, 0.6, 0.1, 0.1, 0.6, 0.1, 0.8])
+    found = _continued(masks, agreement, [0], Bounds())
+    assert found.astype(int).tolist() == [1, 1, 1, 0, 0, 1, 0, 1]
+    agreement[1:5] = 0.1
+    assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [
+        1,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+        1,
+    ]
 
-    def others(*places: tuple[float, float]) -> Callable[[int], np.ndarray]:
-        return lambda i: np.array(places).reshape(-1, 2)
 
-    far, beside = others((90, 40)), others((34, 40))
-    assert _followed(masks, sure, others(), [1]).all()
-    # covered by a hand for a frame: which one it is is clear where no other is near
-    assert _followed(masks, hidden, far, [1]).tolist() == [True] * 4 + [False] + [True] * 3
-    assert _followed(masks, hidden, beside, [1]).tolist() == [True] * 4 + [False] * 4
-    masks[5] |= disc(55, 40)  # takes in its neighbour
-    assert _followed(masks, sure, far, [1]).tolist() == [True] * 5 + [False] * 3
+def test_half_proven_frames_count_only_on_the_way_to_a_proven_one() -> None:
+    masks = np.stack([disc(40, 40)] * 6)
+    agreement = np.array([1.0, 0.4, 0.4, 0.6, 0.4, 0.4])
+    assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [1, 1, 1, 1, 0, 0]
+    agreement[2:4] = 0.1, 0.8
+    assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [1, 0, 0, 1, 0, 0]
+
+
+def test_cells_are_small_beside_the_thickness_of_a_flat_thing() -> None:
+    """What is around a cell says of a pan that is seen from its side what it is in front of."""
+    assert half_breadth(disc(50, 40)) == pytest.approx(RADIUS, rel=0.05)
+    plate = np.hypot((X - 60) / 40, (Y - 40) / 12) < 1
+    assert half_breadth(plate) == pytest.approx(12, rel=0.05)
+    walls = [np.uint8(texture(k, c)[:, :W]) for k, c in ((0, (150, 110, 60)), (3, (70, 90, 140)))]
+    at = [plate, np.roll(plate, 20, 0)]
+    for image, mask in zip(walls, at, strict=True):
+        image[mask] = 30, 30, 40
+    footage = footage_of(walls, [np.zeros((H, W), bool)] * 2)
+    known = {0: plate}
+    bank = _Bank.of(footage, Appearance.learnt(footage, known), known)
+    assert bank.side == 2
+    assert bank.nearer(1, at[1]) > Bounds().proven
+    assert bank.nearer(1, np.roll(plate, -20, 0)) < Bounds().proven
+
+
+def test_one_place_is_not_believed_in_two_frames_that_show_the_same_there() -> None:
+    """The dark trousers behind a dark pan: where it is elsewhere, they look the same."""
+    image, nobody = np.uint8(texture(0, (120, 130, 90))[:, :W]), np.zeros((H, W), bool)
+    trousers = disc(30, 40)
+    image[trousers] = 40, 40, 50
+    frames = [image.copy() for _ in range(3)]
+    frames[1][disc(90, 40)] = 40, 40, 50
+    frames[2][disc(30, 40)] = 200, 60, 50
+    footage = footage_of(frames, [nobody] * 3)
+    scene = static_scene(footage)
+    assert _as_before(footage, scene, 0, trousers, 1, disc(90, 40))
+    assert not _as_before(footage, scene, 0, trousers, 1, trousers)
+    assert not _as_before(footage, scene, 2, trousers, 1, disc(90, 40))
 
 
 def test_a_mask_that_takes_in_the_thing_beside_it_is_not_of_the_usual_size() -> None:
@@ -118,17 +157,6 @@ def test_a_mask_that_takes_in_the_thing_beside_it_is_not_of_the_usual_size() -> 
     fits = _usual_size(area, area > 0, [0])
     assert not fits[8:10].any() and fits[[*range(8), *range(10, 18)]].all()
     assert _usual_size(np.linspace(100, 400, 18), np.ones(18, bool), [0]).all()  # it comes nearer
-
-
-def test_twins_count_only_for_what_somebody_marked() -> None:
-    """White shoes look like a kicked ball, and end the way of one that nobody chose among them."""
-    image, nobody = np.uint8(texture(0, (120, 130, 90))[:, :W]), np.zeros((H, W), bool)
-    mask, other = disc(30, 40), disc(90, 40)
-    image[mask | other] = 250, 250, 250
-    footage = footage_of([image] * 3, [nobody] * 3)
-    marked = PromptedMask(0, mask.astype(np.float32), 1.0, False, nobody)
-    assert learnt(footage, [marked])[1].twins
-    assert not learnt(footage, [replace(marked, proposed=True)])[1].twins
 
 
 def thrown() -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
@@ -164,9 +192,9 @@ def test_the_hand_that_threw_the_ball_and_the_wall_behind_it_are_not_believed() 
     assert usual < 0.65
     assert lies_on_people(footage, 6, hand, usual + 0.15)
     assert not lies_on_people(footage, 3, balls[3], usual + 0.15)
-    scene, known = static_scene(footage), Known({6: balls[6]}, {})
-    assert _was_there(footage, scene, known, [6], 1, balls[6])  # the wall, before it came there
-    assert not _was_there(footage, scene, known, [6], 7, balls[7])
+    scene = static_scene(footage)
+    assert _uncovered(footage, scene, 1, balls[6], 6, balls[6])  # the wall, before it came there
+    assert not _uncovered(footage, scene, 7, balls[7], 6, balls[6])
 
 
 def test_a_hand_that_was_clicked_is_doubtful() -> None:
