@@ -26,7 +26,7 @@ SHARE = 0.8  # of the frames, in which the body is to be within its errors
 # two to four times as far off as on the real ones; by these three, what is said holds on both
 # (benchmarks/real.py, end_to_end.py).
 IMAGE_LASTS, SPACE_LASTS = 1.5, 3.0  # seconds
-FOLLOWED = 4.5
+FOLLOWED = 5.0
 
 
 def body_errors(problem: FitProblem, unknowns: Unknowns, spread: float) -> BodyErrors:

@@ -52,6 +52,7 @@ from hoigs.plugins.estimators.object_tracker.tracker import (
     color_model,
     followed,
     masks_of,
+    never_leaves,
     read_tracks,
     write_tracks,
 )
@@ -196,8 +197,9 @@ class ObjectTrackerEstimator(Estimator):
         prompts: dict[str, list[PromptedMask]] = {}
         notes: list[str] = []
         chosen: dict[str, list[FramePrompt]] = {}
+        faint: set[str] = set()
         for entity in (e for e in wanted if e.prompts):
-            prompts[entity.name] = self._prompted(entity, footage, scene, notes)
+            prompts[entity.name] = self._prompted(entity, footage, scene, notes, faint)
         looks = {n: Appearance.learnt(footage, masks_of(m)) for n, m in prompts.items() if m}
         groups = groups_of(
             prompts, {n: twins_of(k, masks_of(prompts[n])) for n, k in looks.items()}
@@ -227,16 +229,23 @@ class ObjectTrackerEstimator(Estimator):
         tracks |= dict.fromkeys(vague)
         states = states_of(footage, tracks)
         worn = [n for n, t in tracks.items() if n in chosen and t and is_worn(t.soft > 127, people)]
-        states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in worn}
+        part = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
+        states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *part)}
         said = [f"{n}: {why}" for names, why in ((vague, VAGUE), (worn, CLOTHES)) for n in names]
         notes += [*alike, *said, *doubts(tracks, footage)]
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states))
 
     def _prompted(
-        self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]
+        self,
+        entity: EntityRequest,
+        footage: Footage,
+        scene: Scene,
+        notes: list[str],
+        faint: set[str],
     ) -> list[PromptedMask]:
-        """Masks of the entity's prompts."""
+        """Masks of the entity's prompts; its name goes into `faint` where none is set off."""
         masks: list[PromptedMask] = []
+        dim = 0
         for prompt in entity.prompts:
             i = footage.numbers.index(prompt.frame)
             known = color_model(footage, {m.frame: m.soft for m in masks}) if masks else None
@@ -251,12 +260,15 @@ class ObjectTrackerEstimator(Estimator):
                 )
                 continue
             if found.quality < SET_OFF and at_rest(scene, {i: found.soft > 0.5}):
+                dim += 1
                 notes.append(
                     f"{entity.name}: what was clicked in frame {prompt.frame} hardly differs from "
                     "what is around it, and looks like a part of the scene: if it is none, click "
                     "where it is seen better, or give a box"
                 )
             masks.append(found)
+        if masks and dim == len(masks):
+            faint.add(entity.name)
         return masks
 
 

@@ -18,7 +18,7 @@ from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, lies_on_p
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 
 SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a person"
-DOUBTFUL = "doubtful"  # there is a mask, and it may be a part of a person
+DOUBTFUL = "doubtful"  # there is a mask, and it may be a part of a person or of the scene
 WORN, FEWEST = 0.9, 5  # share of a mask, and of the frames, that are clothes; frames that say so
 RIM = 2  # pixels from the edge of the picture within which a mask reaches it
 COVERED = 0.5  # share of its place from which something hides it

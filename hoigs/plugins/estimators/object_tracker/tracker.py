@@ -35,6 +35,8 @@ from hoigs.plugins.estimators.object_tracker.states import LOST
 from hoigs.plugins.estimators.object_tracker.unexplained import completed
 from hoigs.plugins.estimators.object_tracker.verified import proof_of, without_unproven
 
+STAYS = 0.9  # share of the frames in which what is a part of the scene does not differ from it
+
 # Frames in which an object was found best, from which it is followed again.
 #
 # What it looks like from other sides is known then, and a mistake ends at the next such frame.
@@ -239,6 +241,13 @@ def at_rest(scene: Scene, known: dict[int, Bool[np.ndarray, "h w"]]) -> bool:
     """Whether the prompted object looks like a part of the scene in any prompted frame."""
     away = [median_of(scene.difference(i)[m]) for i, m in known.items()]
     return not min(away) > 4
+
+
+def never_leaves(scene: Scene, masks: Bool[np.ndarray, "F h w"]) -> bool:
+    """Whether what is within an object's masks is nearly always the scene itself: a part of it, as
+    far as anyone can tell. An object that is carried is not, wherever it is put down."""
+    shown = np.flatnonzero(masks.any((1, 2))).tolist()
+    return bool(shown) and np.mean([at_rest(scene, {i: masks[i]}) for i in shown]) >= STAYS
 
 
 def stands_out(

@@ -35,6 +35,7 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage, lab_of
 from hoigs.plugins.estimators.object_tracker.path import _cheapest
 from hoigs.plugins.estimators.object_tracker.proposal import Candidate, ranked, without_scenery
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene
+from hoigs.plugins.estimators.object_tracker.states import DOUBTFUL, SEEN
 
 
 @pytest.mark.parametrize("pan", [0.0, 1.5])
@@ -91,6 +92,10 @@ def test_a_click_on_the_wall_is_doubted_and_one_on_the_disc_is_not(tmp_path: Pat
     for place, doubted in ((click(0, 90, 60), True), (click(3), False)):
         found = masks_of(request(tmp_path / str(place.frame), world(), (place,)))
         assert any("looks like a part of the scene" in note for note in found.notes) is doubted
+        states = set(
+            found.states["object"]
+        )  # the masks of what may be the wall are verified nowhere
+        assert (SEEN in states, DOUBTFUL in states) == (not doubted, doubted)
 
 
 def test_a_thing_held_away_from_the_limbs_is_proposed_from_within_the_person_s_mask(
