@@ -229,8 +229,8 @@ class ObjectTrackerEstimator(Estimator):
         tracks |= dict.fromkeys(vague)
         states = states_of(footage, tracks)
         worn = [n for n, t in tracks.items() if n in chosen and t and is_worn(t.soft > 127, people)]
-        part = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
-        states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *part)}
+        scenery = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
+        states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *scenery)}
         said = [f"{n}: {why}" for names, why in ((vague, VAGUE), (worn, CLOTHES)) for n in names]
         notes += [*alike, *said, *doubts(tracks, footage)]
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states))

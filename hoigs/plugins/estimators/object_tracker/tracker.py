@@ -247,7 +247,8 @@ def never_leaves(scene: Scene, masks: Bool[np.ndarray, "F h w"]) -> bool:
     """Whether what is within an object's masks is nearly always the scene itself: a part of it, as
     far as anyone can tell. An object that is carried is not, wherever it is put down."""
     shown = np.flatnonzero(masks.any((1, 2))).tolist()
-    return bool(shown) and np.mean([at_rest(scene, {i: masks[i]}) for i in shown]) >= STAYS
+    stays = [at_rest(scene, {i: masks[i]}) for i in shown]
+    return bool(stays) and sum(stays) >= STAYS * len(stays)
 
 
 def stands_out(
