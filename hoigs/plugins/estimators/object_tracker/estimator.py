@@ -197,9 +197,8 @@ class ObjectTrackerEstimator(Estimator):
         prompts: dict[str, list[PromptedMask]] = {}
         notes: list[str] = []
         chosen: dict[str, list[FramePrompt]] = {}
-        faint: set[str] = set()
         for entity in (e for e in wanted if e.prompts):
-            prompts[entity.name] = self._prompted(entity, footage, scene, notes, faint)
+            prompts[entity.name] = self._prompted(entity, footage, scene, notes)
         looks = {n: Appearance.learnt(footage, masks_of(m)) for n, m in prompts.items() if m}
         groups = groups_of(
             prompts, {n: twins_of(k, masks_of(prompts[n])) for n, k in looks.items()}
@@ -229,6 +228,8 @@ class ObjectTrackerEstimator(Estimator):
         tracks |= dict.fromkeys(vague)
         states = states_of(footage, tracks)
         worn = [n for n, t in tracks.items() if n in chosen and t and is_worn(t.soft > 127, people)]
+        clicked = [n for n, m in prompts.items() if m and n not in chosen]
+        faint = [n for n in clicked if all(_looks_like_scenery(scene, p) for p in prompts[n])]
         scenery = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
         states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *scenery)}
         said = [f"{n}: {why}" for names, why in ((vague, VAGUE), (worn, CLOTHES)) for n in names]
@@ -236,16 +237,10 @@ class ObjectTrackerEstimator(Estimator):
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states))
 
     def _prompted(
-        self,
-        entity: EntityRequest,
-        footage: Footage,
-        scene: Scene,
-        notes: list[str],
-        faint: set[str],
+        self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]
     ) -> list[PromptedMask]:
-        """Masks of the entity's prompts; its name goes into `faint` where none is set off."""
+        """Masks of the entity's prompts."""
         masks: list[PromptedMask] = []
-        dim = 0
         for prompt in entity.prompts:
             i = footage.numbers.index(prompt.frame)
             known = color_model(footage, {m.frame: m.soft for m in masks}) if masks else None
@@ -259,17 +254,19 @@ class ObjectTrackerEstimator(Estimator):
                     "something else, or give a box"
                 )
                 continue
-            if found.quality < SET_OFF and at_rest(scene, {i: found.soft > 0.5}):
-                dim += 1
+            if _looks_like_scenery(scene, found):
                 notes.append(
                     f"{entity.name}: what was clicked in frame {prompt.frame} hardly differs from "
                     "what is around it, and looks like a part of the scene: if it is none, click "
                     "where it is seen better, or give a box"
                 )
             masks.append(found)
-        if masks and dim == len(masks):
-            faint.add(entity.name)
         return masks
+
+
+def _looks_like_scenery(scene: Scene, found: PromptedMask) -> bool:
+    """Whether a mask is hardly set off from what is around it, and is as the scene is there."""
+    return found.quality < SET_OFF and at_rest(scene, {found.frame: found.soft > 0.5})
 
 
 def _proposed(
