@@ -290,7 +290,9 @@ class FitProblem:
         apart = torch.nn.functional.pad(steps, (1, 1), value=float(steps.median()))
         self.spacing = 0.5 * (apart[1:] + apart[:-1])  # seconds that each frame stands for
         self.in_space *= (self.spacing / SPACE_LASTS).clamp_max(1.0)[:, None]
-        self.shape = torch.zeros(body.num_betas, dtype=torch.float64)  # most probable
+        self.shape = torch.zeros(
+            body.num_betas, dtype=torch.float64
+        )  # by which masks move the most probable
         self.prior = PosePrior(turns)
         torso = [self.points.index(mark) for mark in TORSO]
         self.motion = MotionPrior(self.kinematics, torso, len(rows), times, options.smooth)

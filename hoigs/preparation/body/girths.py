@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
-from hoigs.core.interfaces.body import HEAD_PART, LEFT_HAND_PART, RIGHT_HAND_PART, BodyModel
+from hoigs.core.interfaces.body import PART_NAMES, BodyModel
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import BodyPose
 from hoigs.preparation.body.kinematics import Kinematics
@@ -23,7 +23,10 @@ POINTS = 80  # of the outline in a frame, at most
 WIDTH = 320  # pixels of the images in which outlines are compared
 ROUNDS = 4  # points of the outline are chosen anew in each
 # hair, flat hands and shoes are no measure of the body
-LEFT_OUT = (HEAD_PART, LEFT_HAND_PART, RIGHT_HAND_PART, 14, 15)
+LEFT_OUT = [
+    PART_NAMES.index(name)
+    for name in ("head", "left hand", "right hand", "left foot", "right foot")
+]
 SIDEWAYS = 0.3  # cosine between normal and ray, of what may be the outline
 REACH, STEPS = 0.08, 33  # metres along a normal in which the mask's edge is looked for, and samples
 INSIDE = 2.5  # pixels from the outline, where the body is shown and is not
@@ -155,6 +158,7 @@ def outline_gaps(
 
 
 def _normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "T 3"]) -> Float[Tensor, "V 3"]:
+    """Unit normals of vertices: the mean of their faces', weighted by area."""
     a, b, c = vertices[faces].unbind(1)
     of_faces = torch.linalg.cross(b - a, c - a)[:, None].expand(-1, 3, -1).flatten(0, 1)
     normals = torch.zeros_like(vertices).index_add(0, faces.flatten(), of_faces)
