@@ -75,7 +75,7 @@ PLAN = {
         ("estimates", "cameras"),
         ("find_object", "body", "fit_steps", "person_height", "object_size", "chunk", "overlap"),
         slow=True,
-        version=9,
+        version=10,
     ),
     "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True, version=2),
     "objects": Stage(

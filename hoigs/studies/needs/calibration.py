@@ -32,7 +32,7 @@ from hoigs.studies.needs.search_space import (
 )
 from hoigs.studies.needs.trial import Trial, region_of
 
-ERRORS = 2.0  # standard errors: with six frames, 5 % of what is useless is more (Student)
+BEYOND = 0.05  # share of what is useless that is taken for a gain
 OBVIOUS = 3.0  # dB, half of the squared error: where all of that is gained, nothing is measured
 
 
@@ -121,6 +121,8 @@ def calibrated(
             gain that are ignored in any case. moves: the clip's track says that the object moves; a
             model that stands still contradicts it, and is taken only if it is as good.
     """
+    from scipy import stats  # on use: it takes a while to import
+
     finalists = [k for k, scores in enumerate(halving.scores) if steps in scores]
     finalists.sort(key=lambda k: halving.scores[k][steps].mean, reverse=True)
     best = finalists[0]
@@ -143,7 +145,7 @@ def calibrated(
             useless.setdefault(simple, mean_gain(there))
             here = differences(halving.scores[rich][steps], own)
             found = mean_gain([gained - null for gained, null in zip(here, there, strict=True)])
-            errors = ERRORS
+            errors = stats.t.ppf(1 - BEYOND, len(there) - 1)  # 2.9 of three frames, 2.0 of six
         return found.mean > max(errors * found.error, least)
 
     for k in range(best):

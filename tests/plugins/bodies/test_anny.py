@@ -41,6 +41,19 @@ def test_shapes_and_tree(body: AnnyBody) -> None:
     assert set(body.vertex_parts.tolist()) == set(range(len(PART_NAMES)))
 
 
+def test_limbs_are_as_long_as_those_of_adults(body: AnnyBody) -> None:
+    """In parts of the stature, between joint centres: means of men and women by de Leva (1996,
+    Journal of Biomechanics 29) and by Dumas et al. (2007, Journal of Biomechanics 40)."""
+    vertices, joints = body.shaped(torch.zeros(10))
+    stature = vertices[:, 1].max() - vertices[:, 1].min()
+    for start, end, share in (
+        ("shoulder", "elbow", 0.156), ("elbow", "wrist", 0.155), ("hip", "knee", 0.234),
+        ("knee", "ankle", 0.246),
+    ):  # fmt: skip
+        a, b = (joints[joint(body, f"left_{name}")] for name in (start, end))
+        assert float((a - b).norm() / stature) == pytest.approx(share, rel=0.06)
+
+
 @pytest.mark.parametrize("betas", [torch.zeros(10), torch.linspace(-1.5, 1.5, 10)])
 def test_zero_pose_is_a_t_pose(body: AnnyBody, betas: torch.Tensor) -> None:
     vertices, joints = body.shaped(betas)

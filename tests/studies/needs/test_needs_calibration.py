@@ -70,6 +70,19 @@ def test_what_gains_nothing_where_it_is_useless_is_needed() -> None:
     assert found.chosen == 1
 
 
+def test_three_frames_need_a_larger_gain_than_six() -> None:
+    """0.9 dB are left, 2.8 standard errors: of three frames, 5 % of useless gains are more."""
+    assert chosen(useless=score(20.7, 21.1, 21.5))[0].chosen == 0
+    twice = Score(SIMPLE.psnr * 2, SIMPLE.squares * 2, SIMPLE.pixels * 2, 10)
+    rich = score(*RICH.psnr, *RICH.psnr)
+    trials: Any = [
+        Pretended(twice, twice), Pretended(rich, score(20.7, 21.1, 21.5, 20.7, 21.1, 21.5)),
+    ]  # fmt: skip
+    halving = Halving(0, ({4: twice}, {4: rich, STEPS: rich}))
+    found = calibrated(trials, [0.5, 1.0], halving, STEPS, StepBudget(1e3), least=0.0)
+    assert found.chosen == 1
+
+
 def test_another_finalist_may_need_what_the_best_does_not() -> None:
     """The best gains as much where it is useless; the one between them gains nothing there."""
     between = score(20.8, 21.9, 22.7)
