@@ -1,6 +1,6 @@
 # mypy: ignore-errors
 # (Warp's arrays annotate as values)
-"""CUDA kernels that clear and sum the partial gradients; see `common.records`."""
+"""A CUDA kernel that sums the partial gradients; see `warp.records`."""
 
 from hoigs.core.system.quiet_warp import wp
 from hoigs.rasterizers.warp.records import F32, I32
@@ -121,14 +121,3 @@ def gather_partials(
     gather_native(
         wp.tid() // BLOCK_C, count, stride, first_partial, tiles_per_gaussian, partials, drawn
     )
-
-
-@wp.kernel
-def clear_partials(
-    tiles: int, stride: int, offsets: I32, partials: F32, base: int, count: int,
-):  # fmt: skip
-    """Zero the sums of each Gaussian, where all tiles share one list."""
-    row = wp.tid() + base
-    if row < count and offsets[tiles + 1] >= 0:
-        for k in range(stride):
-            partials[row * stride + k] = 0.0

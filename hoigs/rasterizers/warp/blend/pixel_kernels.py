@@ -61,7 +61,7 @@ def backward_pixels(
     min_transmittance: float, records: F32, indices: I32, offsets: I32, features: F32,
     channels: int, background: F32, background_stride: int, color: F32, alpha: F32, depth: F32,
     feature_image: F32, v_color: F32, v_alpha: F32, v_depth: F32, v_feature_image: F32,
-    partials: F32,  # [intersections, MOMENTS + channels]; on a CPU zero before
+    partials: F32,  # [intersections, MOMENTS + channels]; zero before
     base: int, count: int,
 ):  # fmt: skip
     thread = wp.tid() + base

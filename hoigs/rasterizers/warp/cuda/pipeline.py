@@ -85,9 +85,7 @@ class CudaPipeline:
         stride = MOMENTS + inputs.channels + ABSOLUTES * out.absolute
         capacity, tiles = intersections.count, intersections.tiles
         check_addressable(capacity * stride, f"{capacity} tile intersections")
-        partials = inputs.means.new_empty(capacity, stride)
-        arguments = [tiles, stride, intersections.offsets, partials]
-        stream.each(gather_kernels.clear_partials, count, arguments)
+        partials = inputs.means.new_zeros(capacity, stride)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
         arguments += upstream_arguments(upstream, partials)
         lanes = tiles * pixel_source.LANES
