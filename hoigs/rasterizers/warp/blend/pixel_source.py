@@ -191,9 +191,9 @@ _FORWARD = r"""
 
 # S: what the splats not yet passed still add, the sum of w (channels . v + net_v_alpha); see
 # `cpu.backward_source`.
-# Partials are zero before: a splat that hits nothing, and one behind pixels that have stopped, are not
-# written. (Zeros by the warps, scattered as they lie, took three quarters of the pass where much is
-# hidden.)
+# Partials are zero before: a splat that hits nothing, and one behind pixels that have stopped, are
+# not written. (Zeros by the warps, scattered as they lie, took three quarters of the pass where
+# much is hidden.)
 _BACKWARD = r"""
         float S[P], net_v_alpha[P], v[P][4];
         #pragma unroll
