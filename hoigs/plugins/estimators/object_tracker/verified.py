@@ -3,12 +3,14 @@
 A tracker always finds something. Its mask is believed where the looks that were learnt in other
 frames and the nearest of the cells known there agree that it is the object, where its size is one
 that the object has about then, where it does not lie on what was there while the object was
-elsewhere, and where it did not jump. All other masks are dropped: none is better than a wrong one.
+elsewhere, and where it did not jump. Where looks are not sure, as of a thing that glares, it is
+believed as far as the motion of its own pixels carries a proven mask there. All other masks are
+dropped: none is better than a wrong one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +28,14 @@ from hoigs.plugins.estimators.object_tracker.appearance import (
     half_breadth,
 )
 from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
+from hoigs.plugins.estimators.object_tracker.motion import moved_on
 from hoigs.plugins.estimators.object_tracker.path import center_of
 from hoigs.plugins.estimators.object_tracker.prompts import (
     OF_PERSON,
     PromptedMask,
     lies_on_people,
     of_person,
+    overlap,
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
@@ -45,6 +49,7 @@ THERE = 0.7  # share of a mask that looks as it did while the object was elsewhe
 NEAREST = 12  # frames that are believed and nearest in time, with which a frame is compared
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
 MORE = 0.15  # how much more a mask on people has of their colours than the clicked one
+SHARED, ARRIVES = 0.5, 0.6  # of a mask's pixels with one motion; of it where that leads: its overlap
 BANK = 4000  # cells of other things that are compared with
 
 
@@ -53,8 +58,8 @@ class Bounds:
     """Agreements that are asked for.
 
     Attributes:
-        proven: by itself. carried: between proven frames, without a gap. again: at most, of a frame
-            before which it was not seen for long.
+        proven: by itself. carried: between proven frames, without a gap, or where motion leads from
+            one. again: at most, of a frame before which it was not seen for long.
     """
 
     proven: float = 0.5
@@ -73,7 +78,8 @@ class Proof:
     Attributes:
         agreement: of each frame, the lesser of the mean probability of its mask's cells by the
             looks, and of the share of them that is nearer to a known cell of the object than to one
-            of anything else; 0 where the mask is empty. proven: the frames that are believed.
+            of anything else, or the overlap with a proven mask that was carried there by its own
+            motion; 0 where the mask is empty. proven: the frames that are believed.
     """
 
     agreement: Float[np.ndarray, " F"]
@@ -118,7 +124,17 @@ def proof_of(
             believed[i] = masks[i]
     area = masks.sum((1, 2)).astype(float)
     agreement[~_usual_size(area, agreement >= bounds.proven, given)] = 0.0
-    return Proof(agreement, _continued(masks, agreement, given, bounds))
+    arrived: dict[int, float] = {}
+
+    def carried_on(start: int, frames: Sequence[int]) -> list[int]:
+        found = _carried_on(footage, masks, start, frames)
+        arrived.update(found)
+        return list(found)
+
+    proven = _continued(masks, agreement, given, bounds, carried_on)
+    for i, share in arrived.items():
+        agreement[i] = max(agreement[i], share)
+    return Proof(agreement, proven)
 
 
 @dataclass(frozen=True)
@@ -244,14 +260,19 @@ def _continued(
     agreement: Float[np.ndarray, " F"],
     given: list[int],
     bounds: Bounds,
+    carried_on: Callable[[int, Sequence[int]], list[int]] = lambda start, frames: [],
 ) -> Bool[np.ndarray, " F"]:
     """The proven frames, those that continue them, without those to which the object jumped.
 
     From each prompted frame outwards: a frame follows the last one that was believed if the object
     moved no farther than its motion so far foretells, or if enough frames were missed for it to
     have come there. Half proven ones are believed where they lead from a proven frame to another
-    without a gap: a mask that drifts off the object never comes to one. The longer the object was
-    not seen, the surer it must be: what is where it was looks like it more often than not.
+    without a gap: a mask that drifts off the object never comes to one. Of others those are that
+    motion leads to. The longer the object was not seen, the surer it must be: what is where it was
+    looks like it more often than not.
+
+    Args:
+        carried_on: of a proven frame and those after it, the first ones to which motion leads.
     """
     found = np.zeros(len(masks), bool)
     found[given] = True
@@ -274,7 +295,9 @@ def _continued(
                     found[half] = True
                     break
                 if half and not follows(i, last, speed):
-                    (last, speed), half = proven, []
+                    kept = carried_on(proven[0], half)
+                    found[kept] = True
+                    (last, speed), half = (kept[-1], np.zeros(2)) if kept else proven, []
                 if not follows(i, last, speed):
                     continue
                 moved = place[i] - place[last]
@@ -283,6 +306,24 @@ def _continued(
                 if agreement[i] >= bounds.proven:
                     found[half] = True
                     proven, half = (last, speed), []
+            else:
+                found[carried_on(proven[0], half)] = True
+    return found
+
+
+def _carried_on(
+    footage: Footage, masks: Bool[np.ndarray, "F h w"], start: int, frames: Sequence[int]
+) -> dict[int, float]:
+    """How far the mask of frame `start`, moved on from frame to frame by the motion of its own
+    pixels, overlaps the masks of the next `frames`, up to the first with which it does not agree. A
+    mask that slides from the object onto something else does not move as the object's pixels do."""
+    moved, last, found = masks[start], start, dict[int, float]()
+    for i in frames:
+        moved, share = moved_on(footage, last, i, moved)
+        over = overlap(moved, masks[i])
+        if share < SHARED or over < ARRIVES:
+            break
+        found[i], last = over, i
     return found
 
 
