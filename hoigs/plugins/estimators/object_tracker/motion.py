@@ -72,9 +72,10 @@ class Motion:
 
 def moved_on(
     footage: Footage, i: int, j: int, mask: Bool[np.ndarray, "H W"]
-) -> tuple[Bool[np.ndarray, "H W"], float]:
+) -> tuple[Bool[np.ndarray, "H W"], float, float]:
     """Where the pixels of a mask of frame `i` are in frame `j`, by the affine motion that most of
-    them share, and the share of them that it explains."""
+    them share; the share of them that it explains as well as a motion of their own; and by how much
+    their colours differ there, the mean over them of the sum over channels."""
     reach = 2 * 2 * (REACH + 2)  # pixels: the longest shift of the half-size picture
     y, x = np.nonzero(mask)
     rows, columns = (slice(max(v.min() - reach, 0), v.max() + 1 + reach) for v in (y, x))
@@ -82,7 +83,7 @@ def moved_on(
     small = _halved(mask[rows, columns, None].astype(np.float32))[..., 0] > 0.5
     moved = np.zeros_like(mask)
     if not small.any():
-        return moved, 0.0
+        return moved, 0.0, LARGEST
     shift = _shifts(here, there)
     steps = _affine(small, shift)
     least, cost = (_costs(here, there, s, 3) for s in (shift, np.rint(steps).astype(int)))
@@ -94,7 +95,7 @@ def moved_on(
     found = ndimage.map_coordinates(small.astype(np.float32), at, order=1) > 0.5
     found = found.repeat(2, 0).repeat(2, 1)
     moved[rows, columns][: found.shape[0], : found.shape[1]] = found
-    return moved, fits
+    return moved, fits, float(cost[small].mean())
 
 
 def _halved(colors: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "h w C"]:

@@ -33,7 +33,7 @@ from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Tra
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 from hoigs.plugins.estimators.object_tracker.states import LOST
 from hoigs.plugins.estimators.object_tracker.unexplained import completed
-from hoigs.plugins.estimators.object_tracker.verified import proof_of, without_unproven
+from hoigs.plugins.estimators.object_tracker.verified import attached, proof_of, without_unproven
 
 STAYS = 0.9  # share of the frames in which what is a part of the scene does not differ from it
 
@@ -47,8 +47,10 @@ GOOD = 0.6  # of what the best tenth of the frames reach
 
 
 def anchors(footage: Footage, track: Track, prompts: Sequence[PromptedMask]) -> list[PromptedMask]:
-    """Its masks in the best frames of a track, away from the prompted ones."""
+    """Its masks in the best frames of a track, away from the prompted ones: of those that lead to
+    these without a long gap, as what is taken for the object by mistake would be learnt."""
     quality = _quality(footage, track)
+    quality[~attached((track.soft > 127).any((1, 2)), [p.frame for p in prompts])] = 0.0
     least = GOOD * np.quantile(quality, 0.9)
     taken, found = [p.frame for p in prompts], []
     for i in np.argsort(-quality).tolist():

@@ -4,14 +4,15 @@ A tracker always finds something. Its mask is believed where the looks that were
 frames and the nearest of the cells known there agree that it is the object, where its size is one
 that the object has about then, where it does not lie on what was there while the object was
 elsewhere, and where it did not jump. Where looks are not sure, as of a thing that glares, it is
-believed as far as the motion of its own pixels carries a proven mask there. All other masks are
-dropped: none is better than a wrong one.
+believed as far as the motion of its own pixels carries a proven mask there; where looks are sure,
+it is not if that motion leads beside the object, to what was seen there with it. All other masks
+are dropped: none is better than a wrong one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -49,7 +50,12 @@ THERE = 0.7  # share of a mask that looks as it did while the object was elsewhe
 NEAREST = 12  # frames that are believed and nearest in time, with which a frame is compared
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
 MORE = 0.15  # how much more a mask on people has of their colours than the clicked one
-SHARED, ARRIVES = 0.5, 0.6  # of a mask's pixels with one motion; of it where that leads: its overlap
+SHARED, ARRIVES = (
+    0.5,
+    0.6,
+)  # of a mask's pixels with one motion; overlap where that leads
+APART, LONG = 0.5, 8  # overlap of masks that are compared by motion, frames between them at most
+BESIDE = 0.3  # overlap with a mask below which what is moved there is something else
 BANK = 4000  # cells of other things that are compared with
 
 
@@ -124,15 +130,9 @@ def proof_of(
             believed[i] = masks[i]
     area = masks.sum((1, 2)).astype(float)
     agreement[~_usual_size(area, agreement >= bounds.proven, given)] = 0.0
-    arrived: dict[int, float] = {}
-
-    def carried_on(start: int, frames: Sequence[int]) -> list[int]:
-        found = _carried_on(footage, masks, start, frames)
-        arrived.update(found)
-        return list(found)
-
-    proven = _continued(masks, agreement, given, bounds, carried_on)
-    for i, share in arrived.items():
+    motions = Motions(footage, masks)
+    proven = _continued(masks, agreement, given, bounds, motions)
+    for i, share in motions.arrived.items():
         agreement[i] = max(agreement[i], share)
     return Proof(agreement, proven)
 
@@ -260,7 +260,7 @@ def _continued(
     agreement: Float[np.ndarray, " F"],
     given: list[int],
     bounds: Bounds,
-    carried_on: Callable[[int, Sequence[int]], list[int]] = lambda start, frames: [],
+    motions: Motions | None = None,
 ) -> Bool[np.ndarray, " F"]:
     """The proven frames, those that continue them, without those to which the object jumped.
 
@@ -272,7 +272,7 @@ def _continued(
     looks like it more often than not.
 
     Args:
-        carried_on: of a proven frame and those after it, the first ones to which motion leads.
+        motions: None: nothing is known of them.
     """
     found = np.zeros(len(masks), bool)
     found[given] = True
@@ -284,7 +284,11 @@ def _continued(
         off = min(np.hypot(*(way - speed * gap)), np.hypot(*way))
         again = min(bounds.proven + AGAIN * (gap - 1), bounds.again)
         least = bounds.carried if gap == 1 else again
-        return bool(agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap)
+        near = agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap
+        return bool(near) and not (motions and motions.was_beside(i, last))
+
+    def carried_on(start: int, frames: Sequence[int]) -> list[int]:
+        return motions.carried_on(start, frames) if motions else []
 
     for start in given:
         for step in (1, -1):
@@ -311,19 +315,53 @@ def _continued(
     return found
 
 
-def _carried_on(
-    footage: Footage, masks: Bool[np.ndarray, "F h w"], start: int, frames: Sequence[int]
-) -> dict[int, float]:
-    """How far the mask of frame `start`, moved on from frame to frame by the motion of its own
-    pixels, overlaps the masks of the next `frames`, up to the first with which it does not agree. A
-    mask that slides from the object onto something else does not move as the object's pixels do."""
-    moved, last, found = masks[start], start, dict[int, float]()
-    for i in frames:
-        moved, share = moved_on(footage, last, i, moved)
-        over = overlap(moved, masks[i])
-        if share < SHARED or over < ARRIVES:
-            break
-        found[i], last = over, i
+@dataclass(frozen=True)
+class Motions:
+    """What the motion of a mask's own pixels says of other frames.
+
+    Attributes:
+        arrived: overlap of a proven mask that was moved on to a frame with the mask there.
+    """
+
+    footage: Footage
+    masks: Bool[np.ndarray, "F h w"]
+    arrived: dict[int, float] = field(default_factory=dict)
+    _beside: dict[tuple[int, int], bool] = field(default_factory=dict)
+
+    def carried_on(self, start: int, frames: Sequence[int]) -> list[int]:
+        """How far the mask of a frame, moved on from frame to frame, agrees with the masks of the
+        next ones. A mask that slides off the object does not move as the object's pixels do."""
+        moved, last, found = self.masks[start], start, list[int]()
+        for i in frames:
+            moved, share, _ = moved_on(self.footage, last, i, moved)
+            over = overlap(moved, self.masks[i])
+            if share < SHARED or over < ARRIVES:
+                break
+            self.arrived[i], last = over, i
+            found.append(i)
+        return found
+
+    def was_beside(self, i: int, j: int) -> bool:
+        """Whether the mask of frame `i` shows what is seen in frame `j`, too, but beside the mask
+        there: clothes or a hand that look like the object and move with the person."""
+        if abs(i - j) > LONG or overlap(self.masks[i], self.masks[j]) > APART:
+            return False
+        if (i, j) not in self._beside:
+            moved, _, differs = moved_on(self.footage, i, j, self.masks[i])
+            beside = bool(moved.any()) and overlap(moved, self.masks[j]) < BESIDE
+            self._beside[i, j] = beside and differs < SAME
+        return self._beside[i, j]
+
+
+def attached(
+    proven: Bool[np.ndarray, " F"], given: Sequence[int], longest: int = LONG
+) -> Bool[np.ndarray, " F"]:
+    """The proven frames that proven ones lead to from a prompted one, without a longer gap: what
+    was found again after that may be something that looks like the object."""
+    rows, found = np.flatnonzero(proven), np.zeros(len(proven), bool)
+    groups = np.split(rows, np.flatnonzero(np.diff(rows) > longest) + 1)
+    for group in groups:
+        found[group] = bool(np.isin(group, given).any())
     return found
 
 
