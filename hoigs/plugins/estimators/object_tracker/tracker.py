@@ -50,7 +50,8 @@ def anchors(footage: Footage, track: Track, prompts: Sequence[PromptedMask]) -> 
     """Its masks in the best frames of a track, away from the prompted ones: of those that lead to
     these without a long gap, as what is taken for the object by mistake would be learnt."""
     quality = _quality(footage, track)
-    quality[~attached((track.soft > 127).any((1, 2)), [p.frame for p in prompts])] = 0.0
+    shown = np.asarray((track.soft > 127).any((1, 2)))
+    quality[~attached(shown, [p.frame for p in prompts])] = 0.0
     least = GOOD * np.quantile(quality, 0.9)
     taken, found = [p.frame for p in prompts], []
     for i in np.argsort(-quality).tolist():

@@ -50,11 +50,9 @@ THERE = 0.7  # share of a mask that looks as it did while the object was elsewhe
 NEAREST = 12  # frames that are believed and nearest in time, with which a frame is compared
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
 MORE = 0.15  # how much more a mask on people has of their colours than the clicked one
-SHARED, ARRIVES = (
-    0.5,
-    0.6,
-)  # of a mask's pixels with one motion; overlap where that leads
-APART, LONG = 0.5, 8  # overlap of masks that are compared by motion, frames between them at most
+SHARED = 0.5  # of the pixels of a mask: those that move together
+ARRIVES = 0.6  # overlap of a mask that was moved on with the one it comes to
+APART, LONG = 0.5, 8  # overlap up to which masks are compared by motion, and frames between them
 BESIDE = 0.3  # overlap with a mask below which what is moved there is something else
 BANK = 4000  # cells of other things that are compared with
 
