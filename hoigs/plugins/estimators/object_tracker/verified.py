@@ -82,12 +82,13 @@ class Proof:
     Attributes:
         agreement: of each frame, the lesser of the mean probability of its mask's cells by the
             looks, and of the share of them that is nearer to a known cell of the object than to one
-            of anything else, or the overlap with a proven mask that was carried there by its own
-            motion; 0 where the mask is empty. proven: the frames that are believed.
+            of anything else; 0 where the mask is empty. proven: the frames that are believed.
+        arrived: of frames that are by motion alone, the overlap with the mask it carries there.
     """
 
     agreement: Float[np.ndarray, " F"]
     proven: Bool[np.ndarray, " F"]
+    arrived: Mapping[int, float]
 
 
 def proof_of(
@@ -130,9 +131,7 @@ def proof_of(
     agreement[~_usual_size(area, agreement >= bounds.proven, given)] = 0.0
     motions = Motions(footage, masks)
     proven = _continued(masks, agreement, given, bounds, motions)
-    for i, share in motions.arrived.items():
-        agreement[i] = max(agreement[i], share)
-    return Proof(agreement, proven)
+    return Proof(agreement, proven, motions.arrived)
 
 
 @dataclass(frozen=True)
@@ -363,9 +362,16 @@ def attached(
     return found
 
 
-def without_unproven(track: Track, proof: Proof) -> Track:
+def without_unproven(track: Track, proof: Proof, by_looks: bool = False) -> Track:
     """The track with empty masks in frames that are not believed; how sure the others are is how
-    well the cues agree there."""
+    well the cues agree there, or how well the mask agrees with one that motion carried there.
+
+    Args:
+        by_looks: motion counts for nothing in how sure they are: another mask may be proven.
+    """
+    agreement = proof.agreement.copy()
+    for i, share in () if by_looks else proof.arrived.items():
+        agreement[i] = max(agreement[i], share)
     soft: UInt8[np.ndarray, "F h w"] = np.where(proof.proven[:, None, None], track.soft, 0)
-    sure = np.where(proof.proven, np.minimum(proof.agreement, np.maximum(track.confidence, 0.0)), 0)
+    sure = np.where(proof.proven, np.minimum(agreement, np.maximum(track.confidence, 0.0)), 0)
     return Track(soft, sure)
