@@ -15,6 +15,7 @@ BESIDE, FARTHEST = 2, 6  # frames before and after: of these the nearest that th
 REACH = 9  # quarters of its pixels that a pixel may move between: 36 pixels
 LARGEST = 40.0  # difference of colours from which pixels differ entirely
 SAME = (1.4, 2.0)  # a motion explains a pixel up to so much of its own best cost, and more
+INVERTED = 3  # steps by which a motion is inverted: it is nearly a translation
 RIM = 0.12  # breadth of the surroundings of a mask, of the root of its area
 
 
@@ -69,9 +70,37 @@ class Motion:
         return np.mean(found, 0) if found else np.zeros(2)
 
 
-def _halved(colors: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "h w 3"]:
+def moved_on(
+    footage: Footage, i: int, j: int, mask: Bool[np.ndarray, "H W"]
+) -> tuple[Bool[np.ndarray, "H W"], float, float]:
+    """Where the pixels of a mask of frame `i` are in frame `j`, by the affine motion that most of
+    them share; the share of them that it explains as well as a motion of their own; and by how much
+    their colours differ there, the mean over them of the sum over channels."""
+    reach = 2 * 2 * (REACH + 2)  # pixels: the longest shift of the half-size picture
+    y, x = np.nonzero(mask)
+    rows, columns = (slice(max(v.min() - reach, 0), v.max() + 1 + reach) for v in (y, x))
+    here, there = (_halved(footage.colors(k)[rows, columns]) for k in (i, j))
+    small = _halved(mask[rows, columns, None].astype(np.float32))[..., 0] > 0.5
+    moved = np.zeros_like(mask)
+    if not small.any():
+        return moved, 0.0, LARGEST
+    shift = _shifts(here, there)
+    steps = _affine(small, shift)
+    least, cost = (_costs(here, there, s, 3) for s in (shift, np.rint(steps).astype(int)))
+    fits = float((cost < SAME[0] * least + SAME[1])[small].mean())
+    to = np.indices(small.shape).astype(float)
+    at = to - steps
+    for _ in range(INVERTED):
+        at = to - [ndimage.map_coordinates(s, at, order=1, mode="nearest") for s in steps]
+    found = ndimage.map_coordinates(small.astype(np.float32), at, order=1) > 0.5
+    found = found.repeat(2, 0).repeat(2, 1)
+    moved[rows, columns][: found.shape[0], : found.shape[1]] = found
+    return moved, fits, float(cost[small].mean())
+
+
+def _halved(colors: Float[np.ndarray, "H W C"]) -> Float[np.ndarray, "h w C"]:
     rows, columns = colors.shape[0] // 2, colors.shape[1] // 2
-    return colors[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, 3).mean((1, 3))
+    return colors[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, -1).mean((1, 3))
 
 
 def _costs(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.behind import Behind
@@ -100,6 +100,7 @@ def shift_of(
 BY_COLOR, BY_LOOKS = 0.6, 0.2  # weights of their log-odds
 AGAIN, AHEAD = 6, 14  # frames after which the path is found anew, and how far
 NEAR = 0.4  # of the object's breadth: an arm before it may part it by so much
+BEYOND = 0.3  # probability below which a pixel is none of the object's
 SURE = 0.35  # confidence below which the object counts as not seen
 
 
@@ -300,8 +301,23 @@ class Propagation:
         self.area = 0.9 * self.area + 0.1 * float(mask.sum())
         # it turns, and other sides of it have other colours
         if confidence > (0.6 if self.moving else 0.75):
-            seen = histogram(bins_of(self.last.colors), np.where(self.last.soft > 0.5, 1.0, 0.0))
+            valid = self.last.window.inside(self.footage.shape)
+            seen = own_colors(bins_of(self.last.colors), self.last.soft, valid, self.colors.inside)
             self.colors = self.colors.blended(seen, 0.12 if self.moving else 0.04)
+
+
+def own_colors(
+    bins: Int[np.ndarray, "h w"],
+    soft: Float[np.ndarray, "h w"],
+    valid: Bool[np.ndarray, "h w"],
+    known: Float[np.ndarray, "B"],
+) -> Float[np.ndarray, "B"]:
+    """Colours inside a mask; those that more pixels around it have only as far as they were known.
+    A hand comes from beyond the object, of which a new side has colours that are seldom around."""
+    inside, beyond = soft > 0.5, (soft < BEYOND) & valid
+    seen, around = (histogram(bins, m * 1.0) for m in (inside, beyond))
+    own = seen * inside.sum() > around * beyond.sum()
+    return np.where(own, seen, np.minimum(seen, known))
 
 
 def _supported(mask: np.ndarray, prior: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from hoigs.plugins.estimators.object_tracker.footage import (
     TRUNK,
@@ -21,6 +21,8 @@ SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a per
 DOUBTFUL = "doubtful"  # there is a mask, and it may be a part of a person or of the scene
 WORN, FEWEST = 0.9, 5  # share of a mask, and of the frames, that are clothes; frames that say so
 RIM = 2  # pixels from the edge of the picture within which a mask reaches it
+RECENT = 8  # frames before it was seen last that say how it moved
+BEYOND = 0.5  # of what was seen of it last: what has less left in the picture is out of it
 COVERED = 0.5  # share of its place from which something hides it
 SAME_PLACE = 1.5  # breadths between the sightings around a gap, up to which it stayed about there
 
@@ -28,10 +30,11 @@ SAME_PLACE = 1.5  # breadths between the sightings around a gap, up to which it 
 def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str, list[str]]:
     """The state of each object in each frame.
 
-    An object that was last seen at the edge of the picture, or is seen next at it, is out of it;
-    one that was seen before and after in about one place, which a person or another object covers
-    meanwhile, is hidden. Of all else nothing is known: it is lost. A mask on a person whose colours
-    the rest of them has, too, is doubtful: a hand that held the object, or a shirt.
+    An object that moved over the edge of the picture where it was last seen, or moves in where it
+    is seen next, is out of it; one that was seen before and after in about one place, which a
+    person or another object covers meanwhile, is hidden. Of all else nothing is known: it is lost.
+    A mask on a person whose colours the rest of them has, too, is doubtful: a hand that held the
+    object, or a shirt.
     """
     masks = {name: None if t is None else t.soft > 127 for name, t in tracks.items()}
     found = {}
@@ -45,7 +48,7 @@ def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str,
                   else SEEN for i, m in enumerate(own)]  # fmt: skip
         for i in np.flatnonzero(~own.any((1, 2))).tolist():
             around = [*seen[seen < i][-1:], *seen[seen > i][:1]]
-            if any(_at_edge(own[k]) for k in around):
+            if _left(own, seen[seen < i][::-1], i) or _left(own, seen[seen > i], i):
                 states[i] = OUT
             elif len(around) == 2:
                 states[i] = _hidden(footage, own[around[0]], own[around[1]], others, i)
@@ -80,9 +83,27 @@ def is_worn(
     return False
 
 
-def _at_edge(mask: Bool[np.ndarray, "h w"]) -> bool:
-    inner = mask[RIM:-RIM, RIM:-RIM]
-    return bool(inner.sum() < mask.sum())
+def _left(masks: Bool[np.ndarray, "F h w"], seen: Int[np.ndarray, " S"], i: int) -> bool:
+    """Whether an object is beyond an edge of the picture in frame `i`, as it moved while seen.
+
+    What counts is how far it reached from the edge into the picture: of an object that goes out
+    the rest moves on as before, while its middle slows down. One mask at the edge says nothing.
+
+    Args:
+        seen: frames on one side of `i` that show it, the nearest first.
+    """
+    near = [k for k in seen.tolist() if abs(k - seen[0]) < RECENT]
+    if len(near) < 2:
+        return False
+    times = [abs(k - i) for k in near]
+    for turns in range(4):  # each edge in turn is the upper one
+        reach = [int(np.flatnonzero(np.rot90(masks[k], turns).any(1)).max()) + 1 for k in near]
+        if not np.rot90(masks[near[0]], turns)[:RIM].any():
+            continue
+        inwards = np.polyfit(times, reach, 1)[0]  # pixels a frame, away from `i`
+        if reach[0] - inwards * times[0] < BEYOND * reach[0]:
+            return True
+    return False
 
 
 def _hidden(

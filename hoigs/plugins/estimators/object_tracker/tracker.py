@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -33,7 +33,7 @@ from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Tra
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 from hoigs.plugins.estimators.object_tracker.states import LOST
 from hoigs.plugins.estimators.object_tracker.unexplained import completed
-from hoigs.plugins.estimators.object_tracker.verified import proof_of, without_unproven
+from hoigs.plugins.estimators.object_tracker.verified import attached, proof_of, without_unproven
 
 STAYS = 0.9  # share of the frames in which what is a part of the scene does not differ from it
 
@@ -46,12 +46,21 @@ AROUND = 10  # parts of the video before and after a frame that say how large th
 GOOD = 0.6  # of what the best tenth of the frames reach
 
 
-def anchors(footage: Footage, track: Track, prompts: Sequence[PromptedMask]) -> list[PromptedMask]:
-    """Its masks in the best frames of a track, away from the prompted ones."""
+def anchors(
+    footage: Footage, track: Track, prompts: Sequence[PromptedMask], last: Collection[int] = ()
+) -> list[PromptedMask]:
+    """Its masks in the best frames of a track, away from the prompted ones: of those that lead to
+    these without a long gap, as what is taken for the object by mistake would be learnt.
+
+    Args:
+        last: frames that are taken only where no other one is near.
+    """
     quality = _quality(footage, track)
+    shown = np.asarray((track.soft > 127).any((1, 2)))
+    quality[~attached(shown, [p.frame for p in prompts])] = 0.0
     least = GOOD * np.quantile(quality, 0.9)
     taken, found = [p.frame for p in prompts], []
-    for i in np.argsort(-quality).tolist():
+    for i in sorted(range(len(footage)), key=lambda k: (k in last, -quality[k])):
         near = min(abs(i - frame) for frame in taken) < len(footage) / APART
         if quality[i] > least and not near:
             taken.append(i)
@@ -106,7 +115,7 @@ def followed(
     first = tracked(footage, scene, prompts, looks=looks, progress=lambda x: progress(0.4 * x))
     proof = proof_of(footage, scene, prompts, first, looks, known)
     found = without_unproven(first, proof)
-    best, alike = anchors(footage, found, prompts), False
+    best, alike = anchors(footage, found, prompts, proof.arrived), False
     enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
     if best and not enough:
         # where others are like it in prompted frames, as shoes like a ball, any is as good
@@ -119,7 +128,9 @@ def followed(
         )  # fmt: skip
         found = _joined(
             *(
-                without_unproven(t, proof_of(footage, scene, prompts, t, looks, known, alike))
+                without_unproven(
+                    t, proof_of(footage, scene, prompts, t, looks, known, alike), by_looks=True
+                )
                 for t in (first, again)
             )
         )

@@ -3,13 +3,16 @@
 A tracker always finds something. Its mask is believed where the looks that were learnt in other
 frames and the nearest of the cells known there agree that it is the object, where its size is one
 that the object has about then, where it does not lie on what was there while the object was
-elsewhere, and where it did not jump. All other masks are dropped: none is better than a wrong one.
+elsewhere, and where it did not jump. Where looks are not sure, as of a thing that glares, it is
+believed as far as the motion of its own pixels carries a proven mask there; where looks are sure,
+it is not if that motion leads beside the object, to what was seen there with it. All other masks
+are dropped: none is better than a wrong one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -26,12 +29,14 @@ from hoigs.plugins.estimators.object_tracker.appearance import (
     half_breadth,
 )
 from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
+from hoigs.plugins.estimators.object_tracker.motion import moved_on
 from hoigs.plugins.estimators.object_tracker.path import center_of
 from hoigs.plugins.estimators.object_tracker.prompts import (
     OF_PERSON,
     PromptedMask,
     lies_on_people,
     of_person,
+    overlap,
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene, carried
@@ -45,6 +50,10 @@ THERE = 0.7  # share of a mask that looks as it did while the object was elsewhe
 NEAREST = 12  # frames that are believed and nearest in time, with which a frame is compared
 FEW, FADED = 0.3, 0.5  # of a mask: share before a known scene, and of its difference from it then
 MORE = 0.15  # how much more a mask on people has of their colours than the clicked one
+SHARED = 0.5  # of the pixels of a mask: those that move together
+ARRIVES = 0.6  # overlap of a mask that was moved on with the one it comes to
+APART, LONG = 0.5, 8  # overlap up to which masks are compared by motion, and frames between them
+BESIDE = 0.3  # overlap with a mask below which what is moved there is something else
 BANK = 4000  # cells of other things that are compared with
 
 
@@ -53,8 +62,8 @@ class Bounds:
     """Agreements that are asked for.
 
     Attributes:
-        proven: by itself. carried: between proven frames, without a gap. again: at most, of a frame
-            before which it was not seen for long.
+        proven: by itself. carried: between proven frames, without a gap, or where motion leads from
+            one. again: at most, of a frame before which it was not seen for long.
     """
 
     proven: float = 0.5
@@ -74,10 +83,12 @@ class Proof:
         agreement: of each frame, the lesser of the mean probability of its mask's cells by the
             looks, and of the share of them that is nearer to a known cell of the object than to one
             of anything else; 0 where the mask is empty. proven: the frames that are believed.
+        arrived: of frames that are by motion alone, the overlap with the mask it carries there.
     """
 
     agreement: Float[np.ndarray, " F"]
     proven: Bool[np.ndarray, " F"]
+    arrived: Mapping[int, float]
 
 
 def proof_of(
@@ -118,7 +129,9 @@ def proof_of(
             believed[i] = masks[i]
     area = masks.sum((1, 2)).astype(float)
     agreement[~_usual_size(area, agreement >= bounds.proven, given)] = 0.0
-    return Proof(agreement, _continued(masks, agreement, given, bounds))
+    motions = Motions(footage, masks)
+    proven = _continued(masks, agreement, given, bounds, motions)
+    return Proof(agreement, proven, motions.arrived)
 
 
 @dataclass(frozen=True)
@@ -244,14 +257,19 @@ def _continued(
     agreement: Float[np.ndarray, " F"],
     given: list[int],
     bounds: Bounds,
+    motions: Motions | None = None,
 ) -> Bool[np.ndarray, " F"]:
     """The proven frames, those that continue them, without those to which the object jumped.
 
     From each prompted frame outwards: a frame follows the last one that was believed if the object
     moved no farther than its motion so far foretells, or if enough frames were missed for it to
     have come there. Half proven ones are believed where they lead from a proven frame to another
-    without a gap: a mask that drifts off the object never comes to one. The longer the object was
-    not seen, the surer it must be: what is where it was looks like it more often than not.
+    without a gap: a mask that drifts off the object never comes to one. Of others those are that
+    motion leads to. The longer the object was not seen, the surer it must be: what is where it was
+    looks like it more often than not.
+
+    Args:
+        motions: None: nothing is known of them.
     """
     found = np.zeros(len(masks), bool)
     found[given] = True
@@ -263,7 +281,11 @@ def _continued(
         off = min(np.hypot(*(way - speed * gap)), np.hypot(*way))
         again = min(bounds.proven + AGAIN * (gap - 1), bounds.again)
         least = bounds.carried if gap == 1 else again
-        return bool(agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap)
+        near = agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap
+        return bool(near) and not (motions and motions.was_beside(i, last))
+
+    def carried_on(start: int, frames: Sequence[int]) -> list[int]:
+        return motions.carried_on(start, frames) if motions else []
 
     for start in given:
         for step in (1, -1):
@@ -274,7 +296,9 @@ def _continued(
                     found[half] = True
                     break
                 if half and not follows(i, last, speed):
-                    (last, speed), half = proven, []
+                    kept = carried_on(proven[0], half)
+                    found[kept] = True
+                    (last, speed), half = (kept[-1], np.zeros(2)) if kept else proven, []
                 if not follows(i, last, speed):
                     continue
                 moved = place[i] - place[last]
@@ -283,12 +307,71 @@ def _continued(
                 if agreement[i] >= bounds.proven:
                     found[half] = True
                     proven, half = (last, speed), []
+            else:
+                found[carried_on(proven[0], half)] = True
     return found
 
 
-def without_unproven(track: Track, proof: Proof) -> Track:
+@dataclass(frozen=True)
+class Motions:
+    """What the motion of a mask's own pixels says of other frames.
+
+    Attributes:
+        arrived: overlap of a proven mask that was moved on to a frame with the mask there.
+    """
+
+    footage: Footage
+    masks: Bool[np.ndarray, "F h w"]
+    arrived: dict[int, float] = field(default_factory=dict)
+    _beside: dict[tuple[int, int], bool] = field(default_factory=dict)
+
+    def carried_on(self, start: int, frames: Sequence[int]) -> list[int]:
+        """How far the mask of a frame, moved on from frame to frame, agrees with the masks of the
+        next ones. A mask that slides off the object does not move as the object's pixels do."""
+        moved, last, found = self.masks[start], start, list[int]()
+        for i in frames:
+            moved, share, _ = moved_on(self.footage, last, i, moved)
+            over = overlap(moved, self.masks[i])
+            if share < SHARED or over < ARRIVES:
+                break
+            self.arrived[i], last = over, i
+            found.append(i)
+        return found
+
+    def was_beside(self, i: int, j: int) -> bool:
+        """Whether the mask of frame `i` shows what is seen in frame `j`, too, but beside the mask
+        there: clothes or a hand that look like the object and move with the person."""
+        if abs(i - j) > LONG or overlap(self.masks[i], self.masks[j]) > APART:
+            return False
+        if (i, j) not in self._beside:
+            moved, _, differs = moved_on(self.footage, i, j, self.masks[i])
+            beside = bool(moved.any()) and overlap(moved, self.masks[j]) < BESIDE
+            self._beside[i, j] = beside and differs < SAME
+        return self._beside[i, j]
+
+
+def attached(
+    proven: Bool[np.ndarray, " F"], given: Sequence[int], longest: int = LONG
+) -> Bool[np.ndarray, " F"]:
+    """The proven frames that proven ones lead to from a prompted one, without a longer gap: what
+    was found again after that may be something that looks like the object."""
+    rows, found = np.flatnonzero(proven), np.zeros(len(proven), bool)
+    groups = np.split(rows, np.flatnonzero(np.diff(rows) > longest) + 1)
+    for group in groups:
+        found[group] = bool(np.isin(group, given).any())
+    return found
+
+
+def without_unproven(track: Track, proof: Proof, by_looks: bool = False) -> Track:
     """The track with empty masks in frames that are not believed; how sure the others are is how
-    well the cues agree there."""
+    well the cues agree there, or how well the mask agrees with one that motion carried there.
+
+    Args:
+        by_looks: motion counts for nothing in how sure they are: another mask may be proven.
+    """
+    agreement = proof.agreement.copy()
+    for i, share in () if by_looks else proof.arrived.items():
+        agreement[i] = max(agreement[i], share)
     soft: UInt8[np.ndarray, "F h w"] = np.where(proof.proven[:, None, None], track.soft, 0)
-    sure = np.where(proof.proven, np.minimum(proof.agreement, np.maximum(track.confidence, 0.0)), 0)
+    sure = np.where(proof.proven, np.minimum(agreement, np.maximum(track.confidence, 0.0)), 0)
     return Track(soft, sure)

@@ -11,6 +11,7 @@ from test_behind import footage_of
 
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
 from hoigs.plugins.estimators.object_tracker.appearance import Appearance, half_breadth
+from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.prompts import (
     lies_on_people,
     of_person,
@@ -28,11 +29,13 @@ from hoigs.plugins.estimators.object_tracker.states import (
 )
 from hoigs.plugins.estimators.object_tracker.verified import (
     Bounds,
+    Motions,
     _as_before,
     _Bank,
     _continued,
     _uncovered,
     _usual_size,
+    attached,
 )
 
 Y, X = np.mgrid[:H, :W] + 0.5
@@ -79,6 +82,27 @@ def test_states_of_a_thing_behind_the_back_and_of_one_that_nobody_knows_of() -> 
     assert found["never"] == [LOST] * 5
 
 
+def test_a_thing_at_the_edge_is_out_of_the_picture_only_if_it_moved_there() -> None:
+    """One mask that touched the edge was enough, of a thing that lay there or was clicked once."""
+    frames, nobody = [np.zeros((H, W, 3), np.uint8) + 90] * 8, [np.zeros((H, W), bool)] * 8
+    nothing = np.zeros((H, W), bool)
+    ways = {
+        "lies": [(60, 4)] * 4, "once": [None, None, None, (60, 4)],
+        "comes in": [(60, 1 + 2 * k) for k in range(4)],
+        "goes": [(60, 20 - 6 * k) for k in range(4)],
+        "slowly": [(W - 1 - RADIUS + k, 40) for k in range(4)],
+    }  # fmt: skip
+    masks = {
+        n: np.stack([nothing if p is None else disc(*p) for p in [*way, *[None] * 4]])
+        for n, way in ways.items()
+    }
+    tracks = {n: Track(np.uint8(255) * m, np.ones(8)) for n, m in masks.items()}
+    found = {n: s[4:] for n, s in states_of(footage_of(frames, nobody), tracks).items()}
+    assert found["lies"] == found["once"] == found["comes in"] == [LOST] * 4
+    assert found["goes"] == [OUT] * 4
+    assert found["slowly"][0] == LOST  # most of it is still to be seen there
+
+
 @pytest.mark.parametrize(
     "places, believed",
     [
@@ -118,6 +142,52 @@ def test_half_proven_frames_count_only_on_the_way_to_a_proven_one() -> None:
     assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [1, 1, 1, 1, 0, 0]
     agreement[2:4] = 0.1, 0.8
     assert _continued(masks, agreement, [0], Bounds()).astype(int).tolist() == [1, 0, 0, 1, 0, 0]
+
+
+def moving_disc(count: int = 5) -> tuple[Footage, np.ndarray]:
+    """A textured disc that moves 5 pixels a frame to the right below a still one of its looks."""
+    wall, ball = texture(0, (120, 130, 90))[:, :W], texture(1, (200, 60, 50))[:, :W]
+    masks = np.stack([disc(20 + 5 * i, 50) for i in range(count)])
+    frames = []
+    for i, mask in enumerate(masks):
+        image = wall.copy()
+        image[disc(60, 20)] = ball[disc(60, 20)]
+        image[mask] = np.roll(ball, (30, 5 * i), (0, 1))[mask]
+        frames.append(image.astype(np.uint8))
+    return footage_of(frames, [np.zeros((H, W), bool)] * count), masks
+
+
+def test_a_mask_of_doubtful_looks_is_believed_as_far_as_its_own_motion_carries_it() -> None:
+    """A board in whose glare the looks were not sure was lost; a mask that stays where the object
+    was, and slides off it, is still not believed."""
+    footage, masks = moving_disc()
+    agreement = np.array([1.0, 0.9, 0.4, 0.4, 0.4])
+    follows, stays = (Motions(footage, m) for m in (masks, masks.copy()))
+    stays.masks[3:] = masks[2]
+    assert _continued(masks, agreement, [0], Bounds(), follows).all()
+    assert {*follows.arrived} == {2, 3, 4} and min(follows.arrived.values()) > 0.6
+    found = _continued(stays.masks, agreement, [0], Bounds(), stays)
+    assert found[:3].all() and not found[4:].any()
+
+
+def test_what_is_seen_beside_the_object_in_a_frame_near_it_is_not_it() -> None:
+    """Trousers for a pan that was held before them: they are seen beside it, too."""
+    footage, masks = moving_disc()
+    other = masks.copy()
+    other[3] = disc(60, 20)
+    motions = Motions(footage, other)
+    assert motions.was_beside(3, 2)
+    assert not Motions(footage, masks).was_beside(4, 1)
+    sure = np.full(5, 0.9)
+    found = _continued(other, sure, [2], Bounds(), motions)
+    assert found.astype(int).tolist() == [1, 1, 1, 0, 1]
+
+
+def test_frames_after_a_long_gap_are_not_attached_to_the_prompted_one() -> None:
+    proven = np.zeros(40, bool)
+    proven[[0, 1, 2, 12, 15, 20, 22, 36]] = True
+    assert np.flatnonzero(attached(proven, [20], longest=8)).tolist() == [12, 15, 20, 22]
+    assert np.flatnonzero(attached(proven, [0, 36], longest=8)).tolist() == [0, 1, 2, 36]
 
 
 def test_cells_are_small_beside_the_thickness_of_a_flat_thing() -> None:
