@@ -49,6 +49,19 @@ def glb(path: Path) -> str:
             if mesh.is_watertight:
                 closed.append(f"{name} of {mesh.volume * 1000:.1f} litres")
     document = GLTF2().load(str(path))
+    bones = [len(skin.joints) for skin in document.skins]
+    tracks = sum(len(animation.channels) for animation in document.animations)
+    return (
+        f"trimesh: watertight {', '.join(closed) or 'nothing'}; pygltflib: skins of {bones} "
+        f"joints, {tracks} animated channels"
+    )
+
+
+def fbx(path: Path) -> str:
+    import bpy
+
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.import_scene.fbx(filepath=str(path))
     things = bpy.context.scene.objects
     bones = [len(thing.data.bones) for thing in things if thing.type == "ARMATURE"]
     meshes = ", ".join(thing.name for thing in things if thing.type == "MESH")
