@@ -71,7 +71,9 @@ def played(run: Path, page: Path, side: int, seconds: float) -> dict[str, Any]:
     binary = os.environ.get("HOIGS_CHROMIUM") or shutil.which("chromium")
     with sync_playwright() as play:
         browser = play.chromium.launch(executable_path=binary, args=FLAGS)
-        view = {"width": side, "height": side}
+        own = loaded.clip.cameras[0]
+        high = round(side * own.height / own.width)
+        view = {"width": side, "height": high}
         tab = browser.new_context(viewport=view, offline=True).new_page()
         tab.goto(page.as_uri())
         tab.add_style_tag(content="#top, #bar, #about { display: none !important; }")
@@ -87,7 +89,7 @@ def played(run: Path, page: Path, side: int, seconds: float) -> dict[str, Any]:
             tab.evaluate(SEEK, frame)
             wait(drawn)
             shot = np.asarray(Image.open(BytesIO(tab.screenshot())).convert("RGB")).astype(float)
-            camera = fitted(camera_between(loaded.clip, frame), (side, side))
+            camera = fitted(camera_between(loaded.clip, frame), (side, high))
             error = ((shot - drawing.draw(frame, camera, look).image.astype(float)) ** 2).mean()
             scores[str(frame)] = round(10 * math.log10(255**2 / error), 2)
         tab.evaluate("document.getElementById('play').click()")

@@ -70,7 +70,7 @@ class Served:
 
     def settle(self, page: Page) -> None:
         """Wait for a still picture."""
-        page.wait_for_timeout(1500)
+        page.wait_for_timeout(4000)  # a busy machine notices a change late
         while not all(visit.eye.full for visit in self.viewer.visits.values()):
             page.wait_for_timeout(200)
         page.wait_for_timeout(1500)

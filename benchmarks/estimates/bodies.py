@@ -1,4 +1,4 @@
-"""The true body of a built-in clip in the files that GVHMR and WHAM write."""
+"""The true body of a built-in clip in the files that GVHMR, WHAM and SAM 3D Body write."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ def write_bodies(
     clip: Any, body: Any, program: str, folder: Path, degrees: float = 0.0, cm: float = 0.0,
     seed: int = 0, frames: Sequence[int] | None = None,
 ) -> Path:  # fmt: skip
-    """hmr4d_results.pt ("gvhmr") or wham_output.pkl ("wham"), as the program would have written it
-    had it found the true pose, up to noise; GVHMR's intrinsics are the true ones.
+    """hmr4d_results.pt ("gvhmr"), wham_output.pkl ("wham") or sam_3d_body.pkl ("sam-3d-body"), as
+    the program would have written it had it found the true pose, up to noise; the intrinsics of
+    GVHMR and SAM 3D Body are the true ones.
 
     Args:
-        degrees, cm: standard deviation of each joint's rotation and of the place, each frame.
+        degrees, cm: standard deviation of each joint's rotation and of the place, each frame; of
+            SAM 3D Body's, which has keypoints, of each keypoint's place alone.
         frames: that WHAM's person is in; None: all.
     """
     import torch
@@ -30,6 +32,8 @@ def write_bodies(
     from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_angle
 
     rng = np.random.default_rng(seed)
+    if program == "sam-3d-body":
+        return _keypoints(clip, body, folder, rng, cm)
     poses = clip.bodies["human"].poses
     turn = torch.stack([c.world_to_camera[:3, :3] for c in clip.cameras])
     shift = torch.stack([c.world_to_camera[:3, 3] for c in clip.cameras])
@@ -65,4 +69,41 @@ def write_bodies(
     }  # fmt: skip
     path = folder / "wham_output.pkl"
     path.write_bytes(pickle.dumps(people))  # joblib's files are pickles, its arrays aside
+    return path
+
+
+def _keypoints(clip: Any, body: Any, folder: Path, rng: np.random.Generator, cm: float) -> Path:
+    """What SAM 3D Body's process_one_image returns for each frame. Eyes lie at the nose and thumbs
+    at the knuckle of the index finger; keypoints that are not read lie at the hips."""
+    import torch
+
+    from hoigs.core.maths.skinning import skin
+    from hoigs.preparation.body.body_files import MHR_LANDMARKS
+    from hoigs.preparation.body.landmarks import points_of
+
+    points = points_of(body)
+    poses = clip.bodies["human"].poses
+    vertices, joints = body.shaped(poses.betas)
+    bound = torch.cat(
+        (torch.eye(len(joints))[points.joints], body.skinning_weights[points.vertices])
+    )
+    rest = torch.cat((joints[points.joints], vertices[points.vertices]))
+    world = skin(rest, body.skinning_transforms(poses), bound)
+    frames = []
+    for camera, places in zip(clip.cameras, world, strict=True):
+        seen = camera.to_camera(places).numpy()
+        hips = seen[[points.index(23), points.index(24)]].mean(0)
+        keypoints = np.tile(hips, (70, 1))
+        for number, landmark in MHR_LANDMARKS.items():
+            near = {2: 0, 5: 0, 21: 19, 22: 20}.get(landmark, landmark)
+            keypoints[number] = seen[points.index(near)]
+        keypoints += rng.normal(size=keypoints.shape) * cm / 100
+        pixels = keypoints @ camera.K.numpy().T
+        frames.append([{
+            "focal_length": np.float32(camera.K[0, 0]), "pred_cam_t": hips.astype(np.float32),
+            "pred_keypoints_3d": (keypoints - hips).astype(np.float32),
+            "pred_keypoints_2d": (pixels[:, :2] / pixels[:, 2:]).astype(np.float32),
+        }])  # fmt: skip
+    path = folder / "sam_3d_body.pkl"
+    path.write_bytes(pickle.dumps(frames))
     return path

@@ -161,8 +161,8 @@ class PrepareOptions(Options):
     )
     bodies: str | None = Field(
         default=None,
-        description="file of bodies of GVHMR, WHAM, TRAM, PHALP or PromptHMR, relative to the "
-        "video's folder; None: the one that lies beside it, if any",
+        description="file of bodies of GVHMR, WHAM, TRAM, PHALP, PromptHMR or SAM 3D Body, "
+        "relative to the video's folder; None: the one that lies beside it, if any",
     )
     find_object: bool = Field(
         default=True, description="look for an object; False: the clip has the person alone"

@@ -73,7 +73,7 @@ class ExportOptions(PlayedOptions):
     """What is written of a run for another program."""
 
     format: str
-    """Name of an exporter: ply, usd … `hoigs plugins` lists them."""
+    """ply, gltf-4d, bvh …: `hoigs export --help` lists all formats."""
     out: Path | str | None = None
     """New file (x.ply, with x.ply.json beside it), or folder, or x.zip with the folder; default:
     RUN/exports/FORMAT."""

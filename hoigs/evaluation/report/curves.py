@@ -55,7 +55,7 @@ def loss_curve(records: Sequence[dict[str, Any]]) -> str:
         axes.plot(steps, smoothed(total), color=INK, linewidth=1.8, label="total, weighted")
         axes.set_yscale("log")
         axes.legend(
-            frameon=False, fontsize=9, labelcolor="linecolor", ncols=3, loc="upper center",
+            frameon=False, fontsize=9, labelcolor="linecolor", ncols=2, loc="upper center",
             bbox_to_anchor=(0.45, -0.2), columnspacing=1, handlelength=1.4,
         )  # fmt: skip
 

@@ -1,8 +1,9 @@
-"""Layouts of files of GVHMR, WHAM, TRAM, PHALP (4D-Humans) and PromptHMR.
+"""Layouts of files of GVHMR, WHAM, TRAM, PHALP (4D-Humans), PromptHMR and SAM 3D Body.
 
-All hold joint rotations in the convention of SMPL and the body's place in the camera. Their shape
-coefficients belong to SMPL's licensed models and are not used: the pelvis, which shape moves by a
-centimetre or two, is that of the mean shape.
+The first five hold joint rotations in the convention of SMPL and the body's place in the camera.
+Their shape coefficients belong to SMPL's licensed models and are not used: the pelvis, which shape
+moves by a centimetre or two, is that of the mean shape. SAM 3D Body's rotations are those of
+another skeleton (MHR); its keypoints in space, which have its person's size, are read instead.
 """
 
 from __future__ import annotations
@@ -43,25 +44,29 @@ class FileBody:
     Attributes:
         program: who wrote it. path: the file.
         frames: of the video that it has, rising.
-        turns: axis-angle of SMPL's joints 0..21, the first in the camera's axes.
+        turns: axis-angle of SMPL's joints 0..21, the first in the camera's axes; None where the
+            program has another skeleton, and gives `places`.
         pelvis: place in the camera (x right, y down, z away), metres.
         intrinsics: pixels of the video; None: those of `focal`, with the centre in the middle.
         people: that the file has; this one is in most frames.
         resized: the program made the video smaller, and `intrinsics` are of that.
         focal: in diagonals of the picture, or in its longer sides where `weak`.
         weak: the program knows no distance, and its focal length is a convention.
+        places: of MediaPipe's landmarks in the camera, metres, NaN where it has none; None: those
+            of hoigs' own body in these rotations.
     """
 
     program: str
     path: Path
     frames: Int[np.ndarray, " N"]
-    turns: Float[np.ndarray, "N 22 3"]
+    turns: Float[np.ndarray, "N 22 3"] | None
     pelvis: Float[np.ndarray, "N 3"]
     intrinsics: Float[np.ndarray, "N 3 3"] | None
     people: int = 1
     resized: bool = False
     focal: float = 1.0
     weak: bool = False
+    places: Float[np.ndarray, "N 33 3"] | None = None
 
     def K(self, width: int, height: int) -> Float[np.ndarray, "N 3 3"]:
         """Intrinsics of each frame of a video of this size.
@@ -101,15 +106,21 @@ class FileBody:
     def used(self, numbers: Sequence[int]) -> str:
         """What became of it in a clip of these frames, for the report."""
         lacking = len(set(numbers) - set(self.frames.tolist()))
-        lines = [f"started from {self.program}'s joint rotations in {self.path.name}"]
+        if self.turns is None:
+            lines = [f"landmarks are {self.program}'s keypoints in {self.path.name}"]
+        else:
+            lines = [f"started from {self.program}'s joint rotations in {self.path.name}"]
         if lacking:
             lines.append(f"interpolated in {lacking} of {len(numbers)} frames that it lacks")
         if self.people > 1:
             lines.append(f"of its {self.people} people the one in most frames")
         return ", ".join(lines) + "; its shape is not used"
 
-    def rotations(self, numbers: Sequence[int]) -> Float[torch.Tensor, "F 21 3"]:
-        """Axis-angle of joints 1..21 in these frames; those that it lacks are interpolated."""
+    def rotations(self, numbers: Sequence[int]) -> Float[torch.Tensor, "F 21 3"] | None:
+        """Axis-angle of joints 1..21 in these frames; those that it lacks are interpolated. None
+        where the program has another skeleton."""
+        if self.turns is None:
+            return None
         joints = torch.from_numpy(self.turns[:, 1:]).unbind(1)
         turns = torch.stack([nearest_turn(joint) for joint in joints], 1).numpy()
         columns = turns.reshape(len(turns), -1).T
@@ -117,6 +128,7 @@ class FileBody:
         return torch.from_numpy(filled).float().unflatten(-1, (21, 3))
 
 
+HIPS = (23, 24)  # landmarks
 # pelvis of the mean shape before `transl`, metres
 SMPL_PELVIS = (-0.0018, -0.2233, 0.0282)
 SMPLX_PELVIS = (0.0031, -0.3514, 0.0120)
@@ -132,7 +144,16 @@ EXPECTED = {
     "body_pose [23, 3, 3], and camera [3] of each person",
     "PromptHMR": "people with frames [N] and smplx_cam with pose [N, 75] and trans [N, 3], and "
     "camera with img_focal and img_center",
+    "SAM 3D Body": "a list with the list of people of each frame, as process_one_image returns it: "
+    "pred_keypoints_3d [70, 3], pred_keypoints_2d [70, 2], pred_cam_t [3] and focal_length of each",
 }
+# MHR's 70 keypoints (sam_3d_body/metadata/mhr70.py) -> MediaPipe's landmarks; of the fingers, the
+# joints nearest to the palm
+MHR_LANDMARKS = {
+    0: 0, 1: 2, 2: 5, 3: 7, 4: 8, 5: 11, 6: 12, 7: 13, 8: 14, 9: 23, 10: 24, 11: 25, 12: 26, 13: 27,
+    14: 28, 15: 31, 17: 29, 18: 32, 20: 30, 23: 22, 28: 20, 40: 18, 41: 16, 44: 21, 49: 19, 61: 17,
+    62: 15,
+}  # fmt: skip
 
 
 def body_of(content: Any, path: Path) -> FileBody | None:
@@ -147,6 +168,11 @@ def body_of(content: Any, path: Path) -> FileBody | None:
         return _tram(content, path)
     if _has(content, "people") and _has(content, "camera"):
         return _prompthmr(content, path)
+    if isinstance(content, list) and any(
+        isinstance(people, list) and people and _has(people[0], "pred_keypoints_3d")
+        for people in content
+    ):
+        return _sam_3d_body(content, path)
     rows = list(content.values()) if isinstance(content, Mapping) else []
     if rows and all(_has(row, "tid") and _has(row, "smpl") for row in rows):
         return _phalp(rows, path)
@@ -258,6 +284,54 @@ def _phalp(rows: list[Mapping[str, Any]], path: Path) -> FileBody:
         "PHALP", path, frames, turns[:, :22], camera + SMPL_PELVIS, None, people=len(seen),
         focal=PHALP_FOCAL, weak=True,
     )  # fmt: skip
+
+
+def _sam_3d_body(content: list[Any], path: Path) -> FileBody:
+    """Of the largest person in the first frame that has any, and then the nearest to the last one:
+    the program sees each frame alone, and gives people no names."""
+    program = "SAM 3D Body"
+    frames, chosen, most = [], [], 1
+    last: Float[np.ndarray, "70 2"] | None = None
+    for number, people in enumerate(content):
+        if not isinstance(people, list):
+            raise SourceError(f"{path}: frame {number} is no list; expected {EXPECTED[program]}")
+        if not people:
+            continue
+        rows = {"pred_keypoints_2d": [_of(one, "pred_keypoints_2d", path) for one in people]}
+        pixels = _numbers(rows, "pred_keypoints_2d", (70, 2), path, program)
+        if last is None:
+            k = int(np.ptp(pixels, axis=1).prod(-1).argmax())
+        else:
+            k = int(np.linalg.norm(pixels - last, axis=-1).mean(-1).argmin())
+        frames.append(number)
+        chosen.append(people[k])
+        last, most = pixels[k], max(most, len(people))
+    parts = {
+        name: [_of(one, name, path) for one in chosen]
+        for name in ("pred_keypoints_3d", "pred_keypoints_2d", "pred_cam_t", "focal_length")
+    }
+    shift = _numbers(parts, "pred_cam_t", (1, 3), path, program)
+    points = _numbers(parts, "pred_keypoints_3d", (70, 3), path, program) + shift
+    pixels = _numbers(parts, "pred_keypoints_2d", (70, 2), path, program)
+    focal = _numbers(parts, "focal_length", (), path, program)
+    _same_length((points, pixels, focal), path, program)
+    # the file has no principal point, but what was projected with it
+    middle = np.median(pixels - focal[:, None, None] * points[..., :2] / points[..., 2:], axis=1)
+    K = np.tile(np.eye(3), (len(focal), 1, 1))
+    K[:, 0, 0] = K[:, 1, 1] = focal
+    K[:, :2, 2] = middle
+    places = np.full((len(focal), 33, 3), np.nan)
+    places[:, list(MHR_LANDMARKS.values())] = points[:, list(MHR_LANDMARKS)]
+    hips = places[:, list(HIPS)].mean(1)
+    return FileBody(program, path, np.array(frames), None, hips, K, people=most, places=places)
+
+
+def _of(person: Any, name: str, path: Path) -> Any:
+    if not _has(person, name):
+        raise SourceError(
+            f"{path}, of SAM 3D Body: a person has no {name}; expected {EXPECTED['SAM 3D Body']}"
+        )
+    return person[name]
 
 
 def _part(smpl: Any, name: str, path: Path) -> Any:
@@ -393,12 +467,11 @@ def _recognised(path: Path) -> FileBody | None:
 
 # Landmarks of a body that another program has fitted, on hoigs' own body in the same pose.
 
-HIPS = (23, 24)  # landmarks
 OUTSIDE = 0.2  # visibility beyond the picture, where the program has guessed
 
 
 class BodyFileEstimator(Estimator):
-    """The points of the posed body that stand for MediaPipe's landmarks.
+    """The points of the posed body, or the program's own, that stand for MediaPipe's landmarks.
 
     Args:
         path: of the file. body: in its mean shape.
@@ -416,8 +489,12 @@ class BodyFileEstimator(Estimator):
                 f"{self.path} has frame {found.frames[-1]}, the video {video.frames} frames: run "
                 f"{found.program} on this video"
             )
-        marks = list(points_of(self.body).landmarks)
-        places = _places(self.body, found)
+        if found.places is None:
+            marks = list(points_of(self.body).landmarks)
+            places = _places(self.body, found)
+        else:
+            marks = sorted(MHR_LANDMARKS.values())
+            places = found.places[:, marks]
         K = found.K(video.width, video.height)
         seen = np.einsum("nij,nlj->nli", K, places)
         pixels = seen[..., :2] / seen[..., 2:].clip(1e-3)
@@ -437,6 +514,7 @@ class BodyFileEstimator(Estimator):
 
 def _places(body: BodyModel, found: FileBody) -> Float[np.ndarray, "N L 3"]:
     """Of landmarks on the posed body, along the camera's axes, metres."""
+    assert found.turns is not None
     points = points_of(body)
     vertices, joints = body.shaped(torch.zeros(body.num_betas))
     turns = torch.from_numpy(found.turns).float()

@@ -24,7 +24,7 @@ FRAME_FOLDERS = ("frames", "images")  # where a folder of frames may keep them
 _LAYOUT = """  FOLDER/
     video.mp4            the video (any name; one file), or frames/00000.png and so on
     pose_mediapipe.npz   image_xyzv and world_xyzv [F, 33, 4], from MediaPipe Pose; or a body of
-                         GVHMR, WHAM, TRAM, PHALP (4D-Humans) or PromptHMR
+                         GVHMR, WHAM, TRAM, PHALP (4D-Humans), PromptHMR or SAM 3D Body
     hoi_mask/00000.png   person and object together, 0/255, one file a video frame,
                          from a video segmenter; or masks/human/ and masks/object/ apart
     depth/               depth maps as .npz, in an array named metric_depth or disparity

@@ -399,6 +399,7 @@ function draw() {
   const count = sort(camera);
   gl.viewport(0, 0, width, height);
   gl.clearColor(0, 0, 0, 1); gl.clear(gl.COLOR_BUFFER_BIT);
+  if (camera.frame) { gl.enable(gl.SCISSOR_TEST); gl.scissor(...camera.frame.map(Math.round)); } // what lies beside it was never seen
   const p = camera.pose;
   gl.useProgram(placing); gl.bindVertexArray(sources);
   gl.uniformMatrix3fv(uniforms.turn, false, [p[0], p[4], p[8], p[1], p[5], p[9], p[2], p[6], p[10]]);
@@ -419,6 +420,7 @@ function draw() {
   gl.useProgram(program); gl.bindVertexArray(drawn);
   gl.uniform2f(whole, width, height);
   gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
+  gl.disable(gl.SCISSOR_TEST);
 }
 
 // ---- cameras --------------------------------------------------------------------------------
@@ -449,7 +451,8 @@ function current(width, height) {
   if (ofVideo) {
     const scale = Math.min(width / v.size[0], height / v.size[1]);
     const left = (width - scale * v.size[0]) / 2, top = (height - scale * v.size[1]) / 2;
-    return { pose: posed(v.eye, v.forward, v.down), K: [v.K[0] * scale, v.K[1] * scale, v.K[2] * scale + left, v.K[3] * scale + top] };
+    const frame = [left, top, scale * v.size[0], scale * v.size[1]];
+    return { pose: posed(v.eye, v.forward, v.down), frame, K: [v.K[0] * scale, v.K[1] * scale, v.K[2] * scale + left, v.K[3] * scale + top] };
   }
   const f = focus * height;
   return { pose: posed(eye, unit(sub(target, eye)), mul(UP, -1)), K: [f, f, width / 2, height / 2] };

@@ -136,7 +136,8 @@ class Controls:
         gui: viser's. drawing: gives modes and entities. overlays: names on offer.
         wake: called after every change. act: called with the name of a button that was pressed:
             "screenshot", "add key", "clear keys", "film".
-        folded: whether folders are closed at first, as on a phone.
+        folded: all folders are in one that is closed at first, so that on a phone the panel does
+            not cover the picture.
     """
 
     def __init__(
@@ -155,7 +156,8 @@ class Controls:
         self._wake, self._act = wake, act
         self.lock = threading.RLock()
         self._sent_at, self._sent_frame = 0.0, -1.0
-        self._open, self._boxes = not folded, dict[str, Any]()
+        self._folded, self._boxes = folded, dict[str, Any]()
+        self._drawer: Any = None
         self._instead = set[str]()  # overlays that stand in for the video's frames
         self.status = gui.add_markdown("connecting …")
         self._time()
@@ -165,7 +167,12 @@ class Controls:
         self._takes(drawing)
 
     def _folder(self, label: str) -> Any:
-        return self.gui.add_folder(label, expand_by_default=self._open)
+        if not self._folded:
+            return self.gui.add_folder(label)
+        if self._drawer is None:
+            self._drawer = self.gui.add_folder("More", expand_by_default=False)
+        with self._drawer:
+            return self.gui.add_folder(label, expand_by_default=False)
 
     def _time(self) -> None:
         gui, clock = self.gui, self.clock

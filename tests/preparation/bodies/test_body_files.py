@@ -1,4 +1,4 @@
-"""Bodies of GVHMR and WHAM: recognised, read without running code, and used by the body fit."""
+"""Bodies of other programs: recognised, read without running code, and used by the body fit."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 import torch
 from tiny import FRAMES, HEIGHT, WIDTH, make_source
 
+from hoigs.core.interfaces.estimator import VideoRequest
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.preparation.body.body_files import (
@@ -126,6 +127,56 @@ def prompthmr(folder: Path, frames: list[int]) -> Path:
     return folder / "results.pkl"
 
 
+def sam_3d_body(folder: Path, frames: list[int]) -> Path:
+    """What process_one_image returned for each frame: two people where there are any, in turn."""
+    K = np.array(((FOCAL, 0, WIDTH / 2), (0, FOCAL, HEIGHT / 2), (0, 0, 1)))
+    points = np.random.default_rng(0).uniform(-0.4, 0.4, (70, 3))
+    points[9], points[10] = (0.1, 0, 0), (-0.1, 0, 0)  # the hips
+    content = []
+    for i in range(max(frames) + 1):
+        people = []
+        for size, side in ((1.0, 0.0), (0.5, 1.0)):
+            place = PELVIS + np.array((side, 0.0, 0.0))
+            seen = (size * points + place) @ K.T
+            people.append({
+                "bbox": np.zeros(4, np.float32), "focal_length": np.float32(FOCAL), "mask": None,
+                "pred_keypoints_3d": (size * points).astype(np.float32),
+                "pred_keypoints_2d": (seen[:, :2] / seen[:, 2:]).astype(np.float32),
+                "pred_cam_t": place.astype(np.float32),
+                "pred_vertices": np.zeros((9, 3), np.float32),
+            })  # fmt: skip
+        content.append(people[:: 1 if i % 2 else -1] if i in frames else [])
+    (folder / "sam_3d_body.pkl").write_bytes(pickle.dumps(content))
+    return folder / "sam_3d_body.pkl"
+
+
+def test_keypoints_of_sam_3d_body(tmp_path: Path) -> None:
+    path = sam_3d_body(tmp_path, [1, 2, 4])
+    found = body_beside(tmp_path, None)
+    assert found is not None and found.program == "SAM 3D Body" and found.path == path
+    assert found.people == 2 and found.frames.tolist() == [1, 2, 4]
+    assert found.rotations(range(5)) is None and found.places is not None
+    np.testing.assert_allclose(found.pelvis, [PELVIS] * 3, atol=1e-6)
+    np.testing.assert_allclose(found.K(WIDTH, HEIGHT)[0, :2, 2], (WIDTH / 2, HEIGHT / 2), rtol=1e-3)
+    with pytest.raises(SourceError, match=r"\d+x\d+"):
+        found.K(WIDTH, 3 * HEIGHT)
+    video = VideoRequest(
+        FRAMES, WIDTH, HEIGHT, lambda i: np.zeros((HEIGHT, WIDTH, 3), np.uint8), tmp_path, tmp_path
+    )
+    (marks,) = BodyFileEstimator(path, AnnyBody()).estimate(video).landmarks.values()
+    assert marks.world_xyzv is not None and not marks.to_hips
+    hips = marks.image_xyzv[[1, 2, 4]][:, [23, 24], :2].mean(1)
+    right = FOCAL * 0.05 / 2.8 + WIDTH / 2
+    np.testing.assert_allclose(hips, [(right, HEIGHT / 2)] * 3, rtol=1e-3)
+    np.testing.assert_allclose(marks.world_xyzv[1, 23, :3], (0.1, 0, 0), atol=1e-5)
+    assert np.isnan(marks.image_xyzv[3]).all() and np.isfinite(marks.image_xyzv[1, 20]).all()
+    content = pickle.loads(path.read_bytes())
+    del content[1][0]["pred_cam_t"], content[1][1]["pred_cam_t"]
+    path.write_bytes(pickle.dumps(content))
+    with pytest.raises(SourceError, match="pred_cam_t"):
+        read_bodies(path)
+
+
 @pytest.mark.parametrize("make", [tram, phalp, prompthmr])
 def test_other_programs_say_the_same(tmp_path: Path, make: Any) -> None:
     path = make(tmp_path, [1, 2, 4])
@@ -230,8 +281,6 @@ def test_landmarks_beside_it_come_first(tmp_path: Path, tiny_video: Path) -> Non
 
 
 def test_a_file_of_a_longer_video_is_refused(tmp_path: Path) -> None:
-    from hoigs.core.interfaces.estimator import VideoRequest
-
     torch.save(gvhmr(), tmp_path / "x.pt")
     video = VideoRequest(
         FRAMES - 1, WIDTH, HEIGHT, lambda i: np.zeros((HEIGHT, WIDTH, 3), np.uint8), tmp_path,
