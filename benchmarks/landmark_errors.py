@@ -12,7 +12,7 @@ MediaPipe sees the pixels alone. Of each left-right pair of landmarks, millimetr
 - `depth`: bias and spread of its depth in space about the middle of the shoulders, along the axis
   of the network; and `as_given`, the spread if that is taken for the camera's axis.
 
-The fit's own constants (`IN_IMAGE`, `IN_SPACE`) are round numbers from here.
+The constants of the fit, `IN_IMAGE` and `IN_SPACE`, are round numbers from here.
 """
 
 from __future__ import annotations

@@ -220,6 +220,8 @@ class Landmarks:
             y down, z away), and visibility; None when the estimator sees the image only.
         to_hips: those axes are of a camera that is turned to look at the hips' middle, as
             MediaPipe's network sees the person, and not of the video's own.
+        world_spread: by how much a component of `world_xyzv` is off, standard deviation, metres; by
+            default as MediaPipe's was measured to be.
         provenance: who made them, with what, in a line.
         lost: why a frame has none, in words that end a sentence, to the frames of which it is true;
             those without landmarks that are in none are reported without a reason.
@@ -232,6 +234,7 @@ class Landmarks:
     lost: Mapping[str, Sequence[int]] = field(default_factory=dict)
     repaired: Mapping[str, Sequence[int]] = field(default_factory=dict)
     to_hips: bool = False
+    world_spread: float = 0.1
 
 
 @dataclass(frozen=True)

@@ -238,10 +238,10 @@ REWEIGHTINGS = 3  # for the 3D landmarks' origin
 AT_ONCE = 256  # frames whose derivatives are in memory
 ALL = slice(None)
 OF_FRAMES = ("visible", "pixels", "K", "viewmats", "in_space", "space")
-# standard deviations of landmarks, a component: in the image, metres on the person, and pixels at
-# least; in space, metres (benchmarks/landmark_errors.py). Estimates from the fit's own residuals
-# came out smaller on every recording: what is off alike in all frames does not show there.
-IN_IMAGE, LEAST_PIXELS, IN_SPACE = 0.015, 1.0, 0.1
+# standard deviations of landmarks in the image, a component: metres on the person, and pixels at
+# least (benchmarks/landmark_errors.py). Estimates from the fit's own residuals came out smaller on
+# every recording: what is off alike in all frames does not show there.
+IN_IMAGE, LEAST_PIXELS = 0.015, 1.0
 SPACE_LASTS = 0.5  # seconds in which the error of a 3D landmark stays what it is
 
 
@@ -286,6 +286,7 @@ class FitProblem:
         world = landmarks.world[:, rows].double()
         self.in_space = torch.where(torch.isfinite(world).all(-1), self.visible, 0.0)
         self.space = world.nan_to_num()  # metres, along the cameras' axes
+        self.spread = landmarks.spread
         steps = (times[1:] - times[:-1]).double().clamp_min(1e-4)
         apart = torch.nn.functional.pad(steps, (1, 1), value=float(steps.median()))
         self.spacing = 0.5 * (apart[1:] + apart[:-1])  # seconds that each frame stands for
@@ -500,7 +501,7 @@ class FitProblem:
         residuals, weight, cost = self._space_residuals(at.points, unknowns.unit, widen)
         if equations is not None and shared is not None:
             turn = self.viewmats[:, None, :3, :3]
-            weight = (weight / IN_SPACE**2)[..., None].expand_as(residuals)
+            weight = (weight / self.spread**2)[..., None].expand_as(residuals)
             total = weight.sum(1, keepdim=True).clamp_min(1e-12)
             size = 1 + unknowns.unit
             shared = size * turn @ shared
@@ -528,7 +529,7 @@ class FitProblem:
             total = share.sum(1, keepdim=True).clamp_min(1e-12)
             origin = (share * off).sum(1, keepdim=True) / total
             residuals = off - origin
-            squares = residuals.square().sum(-1) / IN_SPACE**2
+            squares = residuals.square().sum(-1) / self.spread**2
             cost, robust = robust_weights(squares, widen)
             weight = self.in_space * robust
         return residuals, weight, cost

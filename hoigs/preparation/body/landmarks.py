@@ -29,6 +29,7 @@ SHOULDERS, HIPS = [11, 12], [23, 24]
 NEAR_GAP, AROUND, LEAST = 6, 15, 8  # frames: from a gap, to compare with, and how many of them
 JUMP = 0.34  # of the shoulders' distance from the way of those around: not this person
 ENOUGH = 8  # landmarks of USED in the image, with which a frame counts
+IN_SPACE = 0.1  # metres by which MediaPipe's are off in space (benchmarks/landmark_errors.py)
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,7 @@ class Landmarks:
         source: for the report.
         fates: of the frames, by their position.
         to_hips: the axes in space are of a camera that looks at the hips' middle (`in_cameras`).
+        spread: by how much a component of `world` is off, standard deviation, metres.
     """
 
     image: Float[Tensor, "F 33 3"]
@@ -105,6 +107,7 @@ class Landmarks:
     source: str = "MediaPipe"
     fates: FrameFates = field(default_factory=FrameFates)
     to_hips: bool = False
+    spread: float = IN_SPACE
 
     @staticmethod
     def from_mediapipe(

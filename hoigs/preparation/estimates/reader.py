@@ -61,8 +61,9 @@ def chosen_landmarks(
         world = track.world_xyzv[video.indices].astype(np.float64)[..., :3]
     fates = FrameFates.at(track.lost, track.repaired, video.indices)
     found = Landmarks(
-        torch.from_numpy(image), torch.from_numpy(world), source, fates, track.to_hips
-    )
+        torch.from_numpy(image), torch.from_numpy(world), source, fates, track.to_hips,
+        track.world_spread,
+    )  # fmt: skip
     count, frames = int(found.found.sum()), len(image)
     at_once = found.found.clone()
     at_once[fates.repaired_frames()] = False  # animals are found at further looks alone

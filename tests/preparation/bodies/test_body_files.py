@@ -14,6 +14,7 @@ import pytest
 import torch
 from tiny import FRAMES, HEIGHT, WIDTH, make_source
 
+from hoigs.core.interfaces.estimator import Landmarks as ByDefault
 from hoigs.core.interfaces.estimator import VideoRequest
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.plugins.bodies.anny import AnnyBody
@@ -165,6 +166,7 @@ def test_keypoints_of_sam_3d_body(tmp_path: Path) -> None:
     )
     (marks,) = BodyFileEstimator(path, AnnyBody()).estimate(video).landmarks.values()
     assert marks.world_xyzv is not None and not marks.to_hips
+    assert 0 < marks.world_spread < ByDefault(np.zeros((1, 33, 4))).world_spread
     hips = marks.image_xyzv[[1, 2, 4]][:, [23, 24], :2].mean(1)
     right = FOCAL * 0.05 / 2.8 + WIDTH / 2
     np.testing.assert_allclose(hips, [(right, HEIGHT / 2)] * 3, rtol=1e-3)
