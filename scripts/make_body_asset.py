@@ -197,6 +197,9 @@ def make() -> dict[str, np.ndarray]:
         "uv": model.texture_coordinates.numpy().astype(np.float16),
         "face_uv": model.face_texture_coordinate_indices.numpy().astype(np.int32),
         "tpose_rot": t_pose_turns(joints, parents).astype(np.float32),
+        "rig_joints": rig.astype(np.float32),
+        "rig_joint_shapedirs": rig_directions.astype(np.float32),
+        "rig_tpose_rot": t_pose_turns(rig, parents).astype(np.float32),
     }
 
 

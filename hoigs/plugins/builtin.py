@@ -83,6 +83,8 @@ PARTS = (
      "entities ignore each other (an ablation)"),
     ("body:anny", "hoigs.plugins.bodies.anny", "AnnyBody", None,
      "the body that comes with hoigs, made from Anny"),
+    ("body:anny-rig", "hoigs.plugins.bodies.anny", "AnnyRigBody", None,
+     "the same with the joints of its rig, for clips of version 1"),
     ("body:smplx", "hoigs.plugins.bodies.smpl", "SmplxBody", "SmplxConfig",
      "SMPL-X, from your own SMPLX_*.npz"),
     ("body:smplh", "hoigs.plugins.bodies.smpl", "SmplhBody", "SmplhConfig",

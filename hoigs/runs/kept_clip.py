@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from hoigs.core.clip_folder.format import body_key
 from hoigs.core.errors import ClipError
 from hoigs.core.system.files import write_whole
 from hoigs.core.system.npz import load_arrays
@@ -21,7 +22,8 @@ from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.world import World
 
-FORMAT, VERSION = "hoigs-kept-clip", 1
+FORMAT, VERSION = "hoigs-kept-clip", 2
+READABLE = (1, VERSION)  # as in clips, bodies of version 1 have keys of their own
 POSE = ("global_orient", "body", "left_hand", "right_hand", "transl", "betas")
 OBJECT = ("points", "colors", "rotations", "translations", "observed", "moving")
 ADVICE = "remove it and name the clip, or train again"
@@ -108,7 +110,7 @@ def load_kept(path: Path) -> Clip:
     try:
         arrays = load_arrays(path)
         header = json.loads(str(arrays["header"]))
-        if (header["format"], header["version"]) != (FORMAT, VERSION):
+        if header["format"] != FORMAT or header["version"] not in READABLE:
             raise ValueError(f"{header['format']} version {header['version']}, expected {VERSION}")
         return _clip(header, arrays, path.parent)
     except (OSError, ValueError, KeyError, TypeError, IndexError, RuntimeError) as error:
@@ -121,7 +123,8 @@ def _clip(header: dict[str, Any], arrays: Mapping[str, np.ndarray], run: Path) -
         found = _below(arrays, f"bodies/{i}/")
         template = found.pop("template", None)
         poses = BodyPose(**found, hand_pose_convention=said["hands"])
-        bodies[name] = BodyTrack(said["model"], poses, said["provenance"], said["gender"], template)
+        model = body_key(said["model"], header["version"])
+        bodies[name] = BodyTrack(model, poses, said["provenance"], said["gender"], template)
     for i, (name, said) in enumerate(header["objects"].items()):
         times = None if said["times"] is None else tuple(said["times"])
         objects[name] = ObjectTrack(

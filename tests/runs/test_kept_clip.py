@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -45,6 +47,19 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, list | tuple):
         return len(a) == len(b) and all(map(same, a, b))
     return bool(a == b)
+
+
+def test_bodies_of_version_1_have_the_joints_that_they_were_fitted_with(clip, tmp_path):
+    file = tmp_path / "clip.npz"
+    built_in = {name: replace(track, model="body:anny") for name, track in clip.bodies.items()}
+    save_kept(replace(clip, bodies=built_in), file)
+    models = []
+    for version in (2, 1):
+        arrays = dict(np.load(file))
+        header = json.loads(str(arrays["header"])) | {"version": version}
+        np.savez(file, **arrays | {"header": np.array(json.dumps(header))})
+        models.append([track.model for track in load_kept(file).bodies.values()])
+    assert models == [["body:anny"], ["body:anny-rig"]]
 
 
 def test_all_but_pixels_and_colours_of_points_comes_back(clip, tmp_path):

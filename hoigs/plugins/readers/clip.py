@@ -18,6 +18,7 @@ from hoigs.core.clip_folder.format import (
     VIEWS,
     ClipHeader,
     ViewsHeader,
+    body_key,
     depth_path,
     ignored_path,
     image_path,
@@ -62,7 +63,7 @@ class ClipFolderReader(ClipReader):
         bodies, objects = {}, {}
         for name, entity in header.entities.items():
             if entity.kind == "human":
-                bodies[name] = _read_body(folder / "bodies" / f"{name}.npz")
+                bodies[name] = _read_body(folder / "bodies" / f"{name}.npz", header.version)
             else:
                 objects[name] = _read_object(folder / "objects" / f"{name}.npz", times)
         moments = [
@@ -252,13 +253,13 @@ def _read_cameras(path: Path, width: int, height: int) -> list[Camera]:
     return [Camera(K, w2c, width, height) for K, w2c in pairs]
 
 
-def _read_body(path: Path) -> BodyTrack:
+def _read_body(path: Path, version: int) -> BodyTrack:
     tensors, words = _tensors(path), load_arrays(path)
     fields = ("global_orient", "body", "left_hand", "right_hand", "transl", "betas")
     convention: Any = str(words["hand_pose_convention"])
     poses = BodyPose(**{f: tensors[f] for f in fields}, hand_pose_convention=convention)
     return BodyTrack(
-        str(words["model"]),
+        body_key(str(words["model"]), version),
         poses,
         str(words.get("provenance", "unknown")),
         gender=str(words["gender"]) if "gender" in words else None,

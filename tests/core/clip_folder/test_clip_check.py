@@ -48,7 +48,7 @@ def test_a_whole_clip_has_no_problem(clip: Path) -> None:
 
 
 HEADER_FAULTS = [
-    (lambda h: h.update(version=2), "version 2; this hoigs reads version 1"),
+    (lambda h: h.update(version=3), "version 3; this hoigs reads version 1 and 2"),
     (lambda h: h.update(format="other"), '"format" is \'other\', expected "hoigs-clip"'),
     (lambda h: h.update(frames=0), "frames: Input should be greater than or equal to 1 (got 0)"),
     (lambda h: h.update(colour=1), "colour: Extra inputs are not permitted"),

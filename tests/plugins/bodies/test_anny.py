@@ -11,7 +11,7 @@ from hoigs.core.interfaces.body import LEFT_WRIST, PART_NAMES, RIGHT_WRIST
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.maths.rotations import axis_angle_to_matrices
 from hoigs.core.values.moment import BodyPose
-from hoigs.plugins.bodies.anny import ASSET, AnnyBody
+from hoigs.plugins.bodies.anny import ASSET, AnnyBody, AnnyRigBody
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +52,14 @@ def test_limbs_are_as_long_as_those_of_adults(body: AnnyBody) -> None:
     ):  # fmt: skip
         a, b = (joints[joint(body, f"left_{name}")] for name in (start, end))
         assert float((a - b).norm() / stature) == pytest.approx(share, rel=0.06)
+
+
+def test_the_rigs_joints_are_kept_for_files_of_before(body: AnnyBody) -> None:
+    rig = AnnyRigBody()
+    assert joint(rig, "left_elbow") == joint(body, "left_elbow") and rig.num_betas == body.num_betas
+    off = rig.shaped(torch.zeros(10))[1] - body.shaped(torch.zeros(10))[1]
+    assert 0.01 < float(off[joint(body, "left_shoulder")].norm()) < 0.05
+    assert float(off[joint(body, "head")].norm()) < 1e-5
 
 
 @pytest.mark.parametrize("betas", [torch.zeros(10), torch.linspace(-1.5, 1.5, 10)])
