@@ -1,7 +1,7 @@
 """What packages that know nothing of hoigs read in its files: one line a file.
 
     python -m venv readers
-    readers/bin/pip install 'plyfile<1.1' trimesh pygltflib bvh usd-core pycolmap bpy
+    readers/bin/pip install 'plyfile<1.1' trimesh pygltflib bvh bpy
     readers/bin/python benchmarks/read_back.py mine.ply body.glb walk.bvh …
 
 For `benchmarks/wants.py`. Nothing of hoigs is imported: it runs in an environment without it.
@@ -70,30 +70,6 @@ def fbx(path: Path) -> str:
     return f"Blender {version}: skeletons of {bones} bones, meshes {meshes}, {last:.0f} frames"
 
 
-def usd(path: Path) -> str:
-    from pxr import Usd, UsdGeom
-
-    stage = Usd.Stage.Open(str(path))
-    kinds: dict[str, int] = {}
-    for prim in stage.Traverse():
-        kinds[prim.GetTypeName()] = kinds.get(prim.GetTypeName(), 0) + 1
-    wanted = ("ParticleField3DGaussianSplat", "SkelRoot", "Mesh", "Camera")
-    return (
-        f"usd-core: {', '.join(f'{kinds.get(kind, 0)} {kind}' for kind in wanted)}, up "
-        f"{UsdGeom.GetStageUpAxis(stage)}, {stage.GetEndTimeCode() - stage.GetStartTimeCode():.0f} "
-        "steps of time"
-    )
-
-
-def colmap(path: Path) -> str:
-    import pycolmap
-
-    model = pycolmap.Reconstruction(str(path))
-    (camera,) = list(model.cameras.values())[:1]
-    focal = f"{camera.focal_length_x:.1f} px"
-    return f"pycolmap: {len(model.images)} images, {camera.model.name}, focal length {focal}"
-
-
 def table(path: Path) -> str:
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -101,14 +77,14 @@ def table(path: Path) -> str:
 
 
 READERS: dict[str, Callable[[Path], str]] = {
-    ".ply": ply, ".bvh": bvh, ".glb": glb, ".fbx": fbx, ".usd": usd, ".csv": table, "": colmap,
+    ".ply": ply, ".bvh": bvh, ".glb": glb, ".fbx": fbx, ".csv": table,
 }  # fmt: skip
 
 
 def main() -> None:
     for name in sys.argv[1:]:
         path = Path(name)
-        print(READERS[path.suffix if path.is_file() else ""](path))
+        print(READERS[path.suffix](path))
 
 
 if __name__ == "__main__":

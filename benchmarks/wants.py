@@ -1,7 +1,7 @@
 """Fifteen things that people ask of such a program: the command that answers each, run here.
 
     python benchmarks/wants.py --video juggle.mp4 --readers readers/bin/python --out FOLDER
-    python benchmarks/wants.py … --only export bodies          # some of them
+    python benchmarks/wants.py … --only ply mhr          # some of them
 
 Each row runs its commands as a user types them, on a built-in clip or on the video, and says what
 came out, by a program that is not hoigs where there is one (`read_back.py`, in an environment of
@@ -160,7 +160,7 @@ def wrong_cameras(shop: Shop) -> str:
     return f"numpy: focal length {focal:.1f} px (1450 at a quarter of the video's size: 362.5)"
 
 
-def blur(shop: Shop) -> str:
+def uncertain(shop: Shop) -> str:
     shop.typed.append("clips/mine/report.html, runs/mine/report.html")
     report = json.loads((shop.folder / "clips/mine/report.json").read_text())
     reasons = ", ".join(report["unknown"])
@@ -270,7 +270,7 @@ WANTS: dict[str, tuple[str, Callable[[Shop], str]]] = {
     "skeleton": ("the motion as BVH and FBX", bvh_and_fbx),
     "hands": ("what the hands do", hands),
     "cameras": ("other cameras than it found", wrong_cameras),
-    "blur": ("to know what is uncertain, and why", blur),
+    "blur": ("to know what is uncertain, and why", uncertain),
     "numbers": ("the same numbers again", same_numbers),
     "long": ("a long video", long_video),
     "people": ("several people", several_people),

@@ -33,13 +33,13 @@ class AnnyBody(LinearBody):
 
     uv: Float[Tensor, "U 2"]
     face_uv: Int[Tensor, "F 3"]
-    _of = ""  # before the names of the asset's arrays that joints are in
+    _prefix = ""  # of the asset's arrays that place the joints
 
     def __init__(self) -> None:
         with np.load(ASSET, allow_pickle=False) as file:
             asset = {key: file[key] for key in file.files}
         for key in ("joints", "joint_shapedirs", "tpose_rot"):
-            asset[key] = asset[self._of + key]
+            asset[key] = asset[self._prefix + key]
         parents = tuple(int(p) for p in asset["parents"])
         weights = _dense_weights(asset["weights"], asset["weight_joints"], len(parents))
         to_t_pose = _t_pose_transforms(asset, parents)
@@ -73,7 +73,7 @@ class AnnyRigBody(AnnyBody):
     13 mm farther down, wrists 9 mm farther up, knees 20 mm higher, hips 45 mm farther apart. Clips
     of version 1 are fitted with them."""
 
-    _of = "rig_"
+    _prefix = "rig_"
 
 
 def _double(array: np.ndarray) -> Tensor:
