@@ -19,6 +19,7 @@ The facts that matter, read from its sources:
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
@@ -93,6 +94,11 @@ def _import_gsplat() -> Any:
         raise RenderError(
             f"GsplatRasterizer needs gsplat ({error}): pip install 'hoigs[gsplat]'"
         ) from error
+    if "viewmats" in inspect.signature(gsplat.spherical_harmonics).parameters:
+        raise RenderError(
+            f"GsplatRasterizer draws with gsplat 1.5.3; {gsplat.__version__} is installed, which "
+            "clamps an alpha to 0.99 instead of 0.999: pip install 'gsplat<1.6'"
+        )
     return gsplat
 
 

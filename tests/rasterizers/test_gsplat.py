@@ -8,11 +8,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gsplat_twin
 import pytest
 import torch
 from backends import declared
+from torch import Tensor
 
 from hoigs.core.errors import RenderError
 from hoigs.core.interfaces.rasterizer import RenderRequest
@@ -51,6 +53,16 @@ def test_without_a_cuda_device_it_says_so() -> None:
 def test_without_gsplat_it_has_the_pip_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(RenderError, match=r"pip install 'hoigs\[gsplat\]'"):
+        OverTwin().render(random_gaussians(3), a_camera())
+
+
+def test_gsplat_1_6_is_refused_with_the_pip_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def harmonics(degrees_to_use: int, means: Tensor, viewmats: Tensor, coeffs: Tensor) -> None:
+        """With the parameters that it has since 1.6."""
+
+    newer = SimpleNamespace(__version__="1.6.0", spherical_harmonics=harmonics)
+    monkeypatch.setitem(sys.modules, "gsplat", newer)
+    with pytest.raises(RenderError, match=r"1\.6\.0 is installed.*pip install 'gsplat<1\.6'"):
         OverTwin().render(random_gaussians(3), a_camera())
 
 

@@ -16,7 +16,7 @@ from hoigs.core.maths.optics import Optics
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
-from hoigs.testing.rasterizer.subject import on
+from hoigs.testing.rasterizer.subject import on, require_close_gradient
 
 CUDA = torch.device("cuda", 0)
 pytestmark = [
@@ -104,6 +104,30 @@ def test_absolute_gradients_are_those_of_the_cpu(channels: int) -> None:
     _, wanted = drawn(rasterizer, *(on(cpu, x) for x in (gaussians, camera, request)))
     for name, gradient in wanted.items():
         assert_close_gradient(name, found[name].cpu(), gradient)
+
+
+@pytest.mark.parametrize("channels", [0, 6])
+def test_what_is_hidden_has_no_gradient_whatever_the_memory_held(channels: int) -> None:
+    """Few tiles, dozens and hundreds of them under a Gaussian, behind pixels that have stopped."""
+    gaussians, camera = scene(6000, 640, 480)
+    larger = 5 * torch.linspace(0, 1, 6000, device=CUDA) ** 20 - 2.5  # some cover the picture
+    gaussians = gaussians.replace(
+        log_scales=gaussians.log_scales + larger[:, None],
+        opacity_logits=gaussians.opacity_logits.abs() + 2,
+    )
+    features = torch.randn(6000, channels, device=CUDA) if channels else None
+    rasterizer, request = WarpRasterizer(), RenderRequest(features=features)
+    wanted = drawn(rasterizer, gaussians, camera, request)[1]
+    nothing = torch.full((100_000_000,), float("nan"), device=CUDA)
+    del nothing  # the next render gets this memory
+    found = drawn(rasterizer, gaussians, camera, request)[1]
+    for name in RAW:
+        assert torch.equal(found[name], wanted[name]), name
+    hidden = (wanted["means"] == 0).all(-1)
+    assert 0.3 < hidden.float().mean() < 0.95
+    on_cpu = (on(torch.device("cpu"), x) for x in (gaussians, camera, request))
+    for name, gradient in drawn(rasterizer, *on_cpu)[1].items():
+        require_close_gradient(name, found[name].cpu(), gradient, 1e-3)  # cut-offs: a splat or so
 
 
 def test_long_lists_are_in_order() -> None:

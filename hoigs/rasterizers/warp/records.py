@@ -35,6 +35,7 @@ SHEAR = wp.constant(3)
 C = wp.constant(4)
 LOG2_OPACITY = wp.constant(5)
 RED = wp.constant(6)  # then green, blue; -0 where clamped so that no gradient passes
+BLUE = wp.constant(8)
 DEPTH = wp.constant(9)  # follows blue: four channels composited alike
 HALF_WIDTH = wp.constant(10)  # of the box where alpha >= min_alpha; negative when culled
 HALF_HEIGHT = wp.constant(11)

@@ -1,51 +1,69 @@
 # mypy: ignore-errors
 # (Warp's arrays annotate as values)
-"""A CUDA kernel that sums the partial gradients; see `warp.records`."""
+"""CUDA kernels that clear and sum the partial gradients; see `warp.records`."""
 
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.records import F32, I32
+from hoigs.rasterizers.warp.records import F32, I32, U8
 
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256  # threads
-ROWS = 64  # Gaussians of a block
+ROWS = BLOCK  # Gaussians of a block
 BLOCK_C = wp.constant(BLOCK)
 
-# The sums of a row's partials, in the place of the first of them, always in the same order. A warp
-# takes `wide` of their numbers at a time, so lanes form groups, three where there are no features.
-# A group adds up a row; where a row has more partials, the groups of a warp share it, and where it
-# has very many, those of the block.
+# The sums of a row's partials, in the place of the first of them, always in the same order. Those
+# that were not written, most where much is hidden, are not read. A warp takes `wide` of their
+# numbers at a time, so lanes form groups, three where there are no features. A group adds up a row;
+# where a row has more partials, the groups of a warp share it, and where it has very many, those of
+# the block.
 _GATHER = r"""
-    constexpr int WARPS = %(BLOCK)d / 32, ROWS = %(ROWS)d, OWN = ROWS / WARPS;
+    constexpr int WARPS = %(BLOCK)d / 32, ROWS = %(ROWS)d;
     constexpr int FEW = 48, MANY = 512, AHEAD = 8;
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
     const int* first_partial_ = (const int*)first_partial.data;
     const int* tiles_per_gaussian_ = (const int*)tiles_per_gaussian.data;
     float* partials_ = (float*)partials.data;
+    const unsigned char* written_ = (const unsigned char*)written.data;
+    int* drawn_ = (int*)drawn.data;
     __shared__ int listed, taken, rows_listed[ROWS];
     __shared__ float parts[WARPS][32];
     if (threadIdx.x == 0) listed = taken = 0;
     __syncthreads();
-    const int row = block * ROWS + warp * OWN + lane;
-    const bool own = lane < OWN && row < count;
+    const int row = block * ROWS + threadIdx.x;
+    const bool own = row < count;
     const int own_first = own ? first_partial_[row] : 0;
     const int own_tiles = own ? tiles_per_gaussian_[row] : 0;
     if (own_tiles > FEW) rows_listed[atomicAdd(&listed, 1)] = row;
-    if (own) ((int*)drawn.data)[row] = own_tiles > 0 ? 1 : 0;
+    // which partials of the lane's row were written, as bits
+    static_assert(FEW <= 64, "there are 64 bits");
+    unsigned long long own_bits = 0;
+    if (own_tiles <= FEW) {
+        #pragma unroll 8
+        for (int j = 0; j < own_tiles; ++j)
+            own_bits |= (unsigned long long)written_[own_first + j] << j;
+    }
+    if (own && own_tiles <= FEW) drawn_[row] = own_bits != 0;
     __syncthreads();
 
     for (int c = 0; c < stride; c += 32) {
         const int wide = stride - c < 32 ? stride - c : 32, groups = 32 / wide;
         const int group = lane / wide, column = c + lane - group * wide;
-        // every `step`-th of n partials; AHEAD loads are in flight together
-        auto sum = [&](const float* from, int n, int step) -> float {
+        // every `step`-th of n partials from `at` on; AHEAD loads are in flight together
+        auto sum = [&](int at, int n, int step, bool& some) -> float {
+            const float* from = partials_ + (long long)at * stride + column;
+            const unsigned char* mark = written_ + at;
             float total = 0.0f;
-            for (; n > 0; n -= AHEAD * step, from += (long long)AHEAD * step * stride) {
+            for (; n > 0; n -= AHEAD * step, mark += AHEAD * step,
+                          from += (long long)AHEAD * step * stride) {
+                bool there[AHEAD];
                 float values[AHEAD];
-                const float* at = from;
                 #pragma unroll
-                for (int j = 0; j < AHEAD; ++j, at += step * stride)
-                    values[j] = j * step < n ? *at : 0.0f;
+                for (int j = 0; j < AHEAD; ++j) there[j] = j * step < n && mark[j * step];
+                #pragma unroll
+                for (int j = 0; j < AHEAD; ++j) {
+                    values[j] = there[j] ? from[(long long)j * step * stride] : 0.0f;
+                    some |= there[j];
+                }
                 #pragma unroll
                 for (int j = 0; j < AHEAD; ++j) total += values[j];
             }
@@ -57,14 +75,29 @@ _GATHER = r"""
                 total += __shfl_sync(0xffffffffu, value, (lane + g * wide) & 31);
             return total;
         };
-        for (int r = 0; r < OWN; r += groups) {
-            const int source = r + group < OWN ? r + group : 31;
-            const int n = __shfl_sync(0xffffffffu, own_tiles, source);
-            const int at = __shfl_sync(0xffffffffu, own_first, source);
-            if (group < groups && n > 1 && n <= FEW) {
-                float* to = partials_ + (long long)at * stride + column;
-                *to = sum(to, n, 1);
+        unsigned rows = __ballot_sync(0xffffffffu, own_bits != 0);
+        while (rows != 0) {
+            int source = -1;  // the group's own row of the next ones
+            for (int g = 0; g < groups; ++g) {
+                if (g == group && rows != 0) source = __ffs(rows) - 1;
+                rows &= rows - 1;
             }
+            unsigned long long bits = __shfl_sync(0xffffffffu, own_bits, source & 31);
+            const int at = __shfl_sync(0xffffffffu, own_first, source & 31);
+            if (source < 0) continue;
+            float* to = partials_ + (long long)at * stride + column;
+            float total = 0.0f;
+            while (bits != 0) {
+                float values[AHEAD];
+                #pragma unroll
+                for (int j = 0; j < AHEAD; ++j) {
+                    values[j] = bits != 0 ? to[(long long)(__ffsll(bits) - 1) * stride] : 0.0f;
+                    bits &= bits - 1;
+                }
+                #pragma unroll
+                for (int j = 0; j < AHEAD; ++j) total += values[j];
+            }
+            *to = total;
         }
         if (threadIdx.x == 0) taken = 0;
         __syncthreads();
@@ -73,28 +106,30 @@ _GATHER = r"""
             if (lane == 0) k = atomicAdd(&taken, 1);
             k = __shfl_sync(0xffffffffu, k, 0);
             if (k >= listed) break;
-            const int n = tiles_per_gaussian_[rows_listed[k]];
+            const int n = tiles_per_gaussian_[rows_listed[k]], at = first_partial_[rows_listed[k]];
             if (n > MANY) continue;
-            float* to = partials_ + (long long)first_partial_[rows_listed[k]] * stride + column;
-            const float mine = group < groups ? sum(to + group * stride, n - group, groups) : 0.0f;
+            bool some = false;
+            const float mine = group < groups ? sum(at + group, n - group, groups, some) : 0.0f;
             const float total = sum_of_groups(mine);
-            __syncwarp();
-            if (group == 0) *to = total;
+            some = __any_sync(0xffffffffu, some);  // all have read
+            if (group == 0 && some) partials_[(long long)at * stride + column] = total;
+            if (lane == 0 && c == 0) drawn_[rows_listed[k]] = some;
         }
         for (int k = 0; k < listed; ++k) {  // all warps together
-            const int n = tiles_per_gaussian_[rows_listed[k]];
+            const int n = tiles_per_gaussian_[rows_listed[k]], at = first_partial_[rows_listed[k]];
             if (n <= MANY) continue;
-            float* to = partials_ + (long long)first_partial_[rows_listed[k]] * stride + column;
             const int begin = warp * groups + group;
+            bool some = false;
             const float mine =
-                group < groups ? sum(to + begin * stride, n - begin, WARPS * groups) : 0.0f;
+                group < groups ? sum(at + begin, n - begin, WARPS * groups, some) : 0.0f;
             parts[warp][lane] = sum_of_groups(mine);
-            __syncthreads();
-            if (warp == 0 && group == 0) {
+            some = __syncthreads_or(some);
+            if (warp == 0 && group == 0 && some) {
                 float total = 0.0f;
                 for (int w = 0; w < WARPS; ++w) total += parts[w][lane];
-                *to = total;
+                partials_[(long long)at * stride + column] = total;
             }
+            if (threadIdx.x == 0 && c == 0) drawn_[rows_listed[k]] = some;
             __syncthreads();
         }
         __syncthreads();
@@ -105,7 +140,7 @@ _GATHER = r"""
 @wp.func_native(_GATHER % {"BLOCK": BLOCK, "ROWS": ROWS})
 def gather_native(
     block: int, count: int, stride: int, first_partial: I32, tiles_per_gaussian: I32,
-    partials: F32, drawn: I32,
+    written: U8, partials: F32, drawn: I32,
 ): ...  # fmt: skip
 
 
@@ -115,9 +150,40 @@ def gather_partials(
     stride: int,
     first_partial: I32,
     tiles_per_gaussian: I32,
-    partials: F32,  # the first of each Gaussian becomes the sum of all of its own
-    drawn: I32,  # [N] 1 where there are partials, else 0
+    written: U8,  # [intersections] 1 where a partial was written
+    partials: F32,  # the first of each Gaussian becomes the sum of those of its own that were
+    drawn: I32,  # [N] 1 where there is one, else 0
 ):
     gather_native(
-        wp.tid() // BLOCK_C, count, stride, first_partial, tiles_per_gaussian, partials, drawn
-    )
+        wp.tid() // BLOCK_C, count, stride, first_partial, tiles_per_gaussian, written, partials,
+        drawn,
+    )  # fmt: skip
+
+
+# Where all tiles share one list, the sums of each Gaussian grow by atomics, from zero.
+_CLEAR = r"""
+    if (thread < words) ((int4*)written.data)[thread] = make_int4(0, 0, 0, 0);
+    if (((const int*)offsets.data)[tiles + 1] < 0) return;
+    for (long long i = thread; i < (long long)count * stride; i += words)
+        ((float*)partials.data)[i] = 0.0f;
+"""
+
+
+@wp.func_native(_CLEAR)
+def clear_native(
+    thread: int, words: int, count: int, stride: int, tiles: int, offsets: I32, written: U8,
+    partials: F32,
+): ...  # fmt: skip
+
+
+@wp.kernel
+def clear_partials(
+    count: int,  # N
+    stride: int, tiles: int, offsets: I32,
+    written: U8,  # [16 words] becomes 0
+    partials: F32,
+    base: int, words: int,
+):  # fmt: skip
+    thread = wp.tid() + base
+    if thread < words:
+        clear_native(thread, words, count, stride, tiles, offsets, written, partials)

@@ -191,9 +191,9 @@ _FORWARD = r"""
 
 # S: what the splats not yet passed still add, the sum of w (channels . v + net_v_alpha); see
 # `cpu.backward_source`.
-# Partials are zero before: a splat that hits nothing, and one behind pixels that have stopped, are
-# not written. (Zeros by the warps, scattered as they lie, took three quarters of the pass where
-# much is hidden.)
+# A splat that hits nothing, and one behind pixels that have stopped, have no partial: `written`
+# says which do. (Zeros by the warps, scattered as they lie, took three quarters of the pass where
+# much is hidden; zeros everywhere before it, as long as half of it.) On a CPU all are zero before.
 _BACKWARD = r"""
         float S[P], net_v_alpha[P], v[P][4];
         #pragma unroll
@@ -300,6 +300,7 @@ _BACKWARD = r"""
                     else if (!COLOR && sum_of_lane < 6) *to += total;
                     else *to = total;
                 }
+                if (COLOR && lane == 0) ((unsigned char*)written.data)[partial] = 1;
                 if (ABSOLUTE && COLOR) {  // both over 32 lanes: lanes 0 and 16 hold one each
                     const float away = in5 ? absolutes[0] : absolutes[1];
                     float own = in5 ? absolutes[1] : absolutes[0];

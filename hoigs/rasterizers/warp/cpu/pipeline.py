@@ -46,6 +46,7 @@ class CpuPipeline(ABC):
     forward_kernel: ClassVar[Any]
     backward_kernel: ClassVar[Any]
     absolute_kernel: ClassVar[Any]  # backward, with absolute gradients
+    further: ClassVar[tuple[Tensor, ...]] = ()  # what the backward kernels take besides
 
     def __init__(self, cores: Cores) -> None:
         self.cores = cores
@@ -87,7 +88,7 @@ class CpuPipeline(ABC):
         check_addressable(count * stride, f"{count} tile intersections")
         partials = inputs.means.new_zeros(count, stride)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
-        arguments += upstream_arguments(upstream, partials)
+        arguments += [*upstream_arguments(upstream, partials), *self.further]
         kernel = self.absolute_kernel if out.absolute else self.backward_kernel
         self._tiles(kernel, intersections, arguments)
         arguments = adjoint_arguments(inputs, settings, records, intersections, partials, out)
@@ -173,6 +174,7 @@ class PortablePipeline(CpuPipeline):
 
     forward_kernel, backward_kernel = pixel_kernels.forward_pixels, pixel_kernels.backward_pixels
     absolute_kernel = scalar_absolute_kernels.absolute_pixels
+    further = (torch.empty(0, dtype=torch.uint8),)
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
         depths, height = projected.drawn_depths, pixel_source.TILE_HEIGHT

@@ -85,15 +85,20 @@ class CudaPipeline:
         stride = MOMENTS + inputs.channels + ABSOLUTES * out.absolute
         capacity, tiles = intersections.count, intersections.tiles
         check_addressable(capacity * stride, f"{capacity} tile intersections")
-        partials = inputs.means.new_zeros(capacity, stride)
+        partials = inputs.means.new_empty(capacity, stride)
+        words = -(-capacity // 16)
+        written = partials.new_empty(16 * words, dtype=torch.uint8)
+        arguments = [count, stride, tiles, intersections.offsets, written, partials]
+        stream.each(gather_kernels.clear_partials, words, arguments)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
-        arguments += upstream_arguments(upstream, partials)
+        arguments += [*upstream_arguments(upstream, partials), written]
         lanes = tiles * pixel_source.LANES
         kernel = absolute_kernels.absolute_pixels if out.absolute else pixel_kernels.backward_pixels
         stream.each(kernel, lanes, arguments, TILE_BLOCK)
 
         first, drawn = intersections.first_partial, torch.empty_like(intersections.first_partial)
-        arguments = [count, stride, first, intersections.tiles_per_gaussian, partials, drawn]
+        of_gaussian = [first, intersections.tiles_per_gaussian]
+        arguments = [count, stride, *of_gaussian, written, partials, drawn]
         blocks = -(-count // gather_kernels.ROWS)
         stream.blocks(gather_kernels.gather_partials, blocks, gather_kernels.BLOCK, arguments)
         gathered = replace(intersections, tiles_per_gaussian=drawn)  # one partial each from here on

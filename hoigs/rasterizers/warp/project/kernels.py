@@ -15,14 +15,11 @@ from hoigs.rasterizers.warp.project.spherical_harmonics import (
     sh_color_adjoint,
 )
 from hoigs.rasterizers.warp.records import (
-    DEPTH,
+    BLUE,
     F32,
-    HALF_HEIGHT,
     HALF_LOG2E,
     HALF_WIDTH,
     I32,
-    INVERSE_HALF_WIDTH,
-    LOG2_OPACITY,
     M_G,
     M_RED,
     M_U,
@@ -35,17 +32,12 @@ from hoigs.rasterizers.warp.records import (
     REACH_SLACK,
     RECORD,
     RED,
-    SHEAR,
     SLOPE,
     U8,
     VEC3,
     VEC4,
-    WAIST_X,
-    WAIST_Y,
-    A,
     C,
     X,
-    Y,
 )
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS, "max_unroll": 4})
@@ -90,6 +82,21 @@ def row_is_finite(
 @wp.func
 def log2_sigmoid(logit: float) -> float:
     return -wp.log2(1.0 + wp.exp(-logit))
+
+
+# On CUDA by one store: a record is a cache line, which stores of single floats write in parts.
+@wp.func_native("""
+    float* to = (float*)records.data + at;
+#if defined(__CUDA_ARCH__)
+    *(float4*)to = make_float4(first, second, third, fourth);
+#else
+    to[0] = first;
+    to[1] = second;
+    to[2] = third;
+    to[3] = fourth;
+#endif
+""")
+def put_four(records: F32, at: int, first: float, second: float, third: float, fourth: float): ...
 
 
 def make_kernels(module, onto_screen, is_regular, shape_adjoint):
@@ -185,21 +192,16 @@ def make_kernels(module, onto_screen, is_regular, shape_adjoint):
         reach = reach * REACH_SLACK
         half_width = wp.sqrt(reach * s.xx)
         drawn_depths[row] = s.cam[2]
-        records[r + X] = s.u
-        records[r + Y] = s.v
-        records[r + A] = HALF_LOG2E * s.yy / s.det
-        records[r + SHEAR] = s.xy / s.yy
-        records[r + C] = HALF_LOG2E / s.yy
-        records[r + LOG2_OPACITY] = log2_opacity
-        for k in range(3):
-            records[r + RED + k] = not_negative(color[k])
-        records[r + DEPTH] = s.cam[2]
-        records[r + HALF_WIDTH] = half_width
-        records[r + HALF_HEIGHT] = wp.sqrt(reach * s.yy)
-        records[r + SLOPE] = s.xy / s.xx
-        records[r + WAIST_Y] = wp.sqrt(reach * s.det / s.xx)
-        records[r + WAIST_X] = wp.sqrt(reach * s.det / s.yy)
-        records[r + INVERSE_HALF_WIDTH] = 1.0 / wp.max(half_width, 1.0e-6)
+        put_four(records, r + X, s.u, s.v, HALF_LOG2E * s.yy / s.det, s.xy / s.yy)
+        red = not_negative(color[0])
+        green = not_negative(color[1])
+        put_four(records, r + C, HALF_LOG2E / s.yy, log2_opacity, red, green)
+        half_height = wp.sqrt(reach * s.yy)
+        put_four(records, r + BLUE, not_negative(color[2]), s.cam[2], half_width, half_height)
+        waist_y = wp.sqrt(reach * s.det / s.xx)
+        waist_x = wp.sqrt(reach * s.det / s.yy)
+        inverse = 1.0 / wp.max(half_width, 1.0e-6)
+        put_four(records, r + SLOPE, s.xy / s.xx, waist_y, waist_x, inverse)
 
     def project_adjoint(
         means: VEC3, quats: VEC4, log_scales: VEC3, opacity_logits: F32, sh: VEC3,

@@ -101,19 +101,46 @@ def sh_direction_gradient(d: wp.vec3, s: Vec16, active_bases: int) -> wp.vec3:
     return wp.vec3(gx, gy, gz)
 
 
+# On CUDA a thread fetches all coefficients of a Gaussian at once, four by each load where they
+# begin at a multiple of 16 bytes; in a loop, each load would wait for the one before.
+@wp.func_native(r"""
+    const float* of = (const float*)sh.data + 3ll * row * stored_bases;
+    wp::vec_t<3, float> color(0.5f, 0.5f, 0.5f);
+#if defined(__CUDA_ARCH__)
+    float values[48];
+    if (((size_t)of & 15) == 0) {
+        #pragma unroll
+        for (int i = 0; i < 12; ++i) {
+            const float4 four = 4 * i < 3 * active_bases ? ((const float4*)of)[i]
+                                                         : make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+            values[4 * i] = four.x; values[4 * i + 1] = four.y;
+            values[4 * i + 2] = four.z; values[4 * i + 3] = four.w;
+        }
+    } else {
+        #pragma unroll
+        for (int i = 0; i < 48; ++i) values[i] = i < 3 * active_bases ? of[i] : 0.0f;
+    }
+    #pragma unroll
+    for (int k = 0; k < 16; ++k)
+        #pragma unroll
+        for (int j = 0; j < 3; ++j) color[j] += basis[k] * values[3 * k + j];
+#else
+    for (int k = 0; k < active_bases; ++k)
+        for (int j = 0; j < 3; ++j) color[j] += basis[k] * of[3 * k + j];
+#endif
+    return color;
+""")
+def sh_sum(sh: VEC3, row: int, stored_bases: int, active_bases: int, basis: Vec16) -> wp.vec3: ...
+
+
 @wp.func
 def sh_color(
     sh: VEC3, row: int, stored_bases: int, active_bases: int, direction: wp.vec3
 ) -> wp.vec3:
     """0.5 + sum_k sh_k Y_k, before it is clamped at zero."""
-    first = row * stored_bases
     if active_bases == 1:
-        return wp.vec3(0.5, 0.5, 0.5) + C0 * sh[first]
-    basis = sh_basis(direction, active_bases)
-    color = wp.vec3(0.5, 0.5, 0.5)
-    for k in range(active_bases):
-        color += basis[k] * sh[first + k]
-    return color
+        return wp.vec3(0.5, 0.5, 0.5) + C0 * sh[row * stored_bases]
+    return sh_sum(sh, row, stored_bases, active_bases, sh_basis(direction, active_bases))
 
 
 @wp.func

@@ -26,7 +26,7 @@ RECORD_C = wp.constant(RECORD)
 POSE_C = wp.constant(POSE)
 
 # Walks the numbers of a warp's rows, `width` each, as they lie in memory: `i` in the array, and
-# `at` in the buffer.
+# `at` in the buffer; `r` is the row's number in the warp.
 _WALK = r"""
     const int lane = threadIdx.x & 31, first = row - lane;
     const int rows = count - first < 32 ? count - first : 32;
@@ -52,8 +52,12 @@ def _walk(move: str) -> str:
 def row_buffer() -> wp.uint64: ...
 
 
-@wp.func_native(_walk("mine[at] = array[i];") + "__syncwarp();")
-def load_rows(values: F32, buffer: wp.uint64, row: int, count: int, width: int): ...
+@wp.func_native(
+    "const unsigned asked = __ballot_sync(0xffffffffu, wanted);"
+    + _walk("if (asked >> r & 1) mine[at] = array[i];")
+    + "__syncwarp();"
+)
+def load_rows(values: F32, buffer: wp.uint64, row: int, count: int, width: int, wanted: bool): ...
 
 
 @wp.func_native("__syncwarp();" + _walk("array[i] = mine[at];"))
@@ -85,33 +89,35 @@ def harmonics_adjoint(
 ):  # fmt: skip
     row = wp.tid()
     buffer = row_buffer()
-    load_rows(sh, buffer, row, count, 3 * stored_bases)
+    visible = False
+    if row < count:
+        visible = drawn[row] != 0
+    load_rows(sh, buffer, row, count, 3 * stored_bases, visible)
     basis = Vec16()
     v_color = wp.vec3(0.0, 0.0, 0.0)
-    if row < count:  # noqa: SIM102  older Warps' `and` evaluates both sides
-        if drawn[row] != 0:
-            p = first_partial[row] * stride + M_RED
+    if visible:
+        p = first_partial[row] * stride + M_RED
+        for j in range(3):
+            if learns(records[row * RECORD_C + RED + j]):
+                v_color[j] = partials[p + j]
+        toward = means[row] - camera_center(world_to_camera)
+        distance = wp.length(toward)
+        direction = toward / distance
+        basis = sh_basis(direction, active_bases)
+        dots = Vec16()
+        for k in range(16):
+            if k < active_bases:
+                dots[k] = (
+                    get(buffer, 3 * k) * v_color[0]
+                    + get(buffer, 3 * k + 1) * v_color[1]
+                    + get(buffer, 3 * k + 2) * v_color[2]
+                )
+        v_direction = sh_direction_gradient(direction, dots, active_bases)
+        v_center = (wp.dot(direction, v_direction) * direction - v_direction) / distance
+        v_means[row] = v_means[row] - v_center
+        if has_pose != 0:
             for j in range(3):
-                if learns(records[row * RECORD_C + RED + j]):
-                    v_color[j] = partials[p + j]
-            toward = means[row] - camera_center(world_to_camera)
-            distance = wp.length(toward)
-            direction = toward / distance
-            basis = sh_basis(direction, active_bases)
-            dots = Vec16()
-            for k in range(16):
-                if k < active_bases:
-                    dots[k] = (
-                        get(buffer, 3 * k) * v_color[0]
-                        + get(buffer, 3 * k + 1) * v_color[1]
-                        + get(buffer, 3 * k + 2) * v_color[2]
-                    )
-            v_direction = sh_direction_gradient(direction, dots, active_bases)
-            v_center = (wp.dot(direction, v_direction) * direction - v_direction) / distance
-            v_means[row] = v_means[row] - v_center
-            if has_pose != 0:
-                for j in range(3):
-                    v_pose[row * POSE_C + 12 + j] = v_center[j]
+                v_pose[row * POSE_C + 12 + j] = v_center[j]
     for k in range(16):
         if k < stored_bases:
             for j in range(3):
