@@ -73,26 +73,32 @@ def frames_of(source) -> list[np.ndarray]:
         return [f.to_ndarray(format="rgb24") for f in video.decode(video=0)]
 
 
+def prepare(name: str, cache: Path) -> None:
+    """Find masks and landmarks of a recording, unless they are there."""
+    file = cache / f"{name}.npz"
+    if file.is_file():
+        return
+    from hoigs.preparation.kept import last_kept
+    from hoigs.preparation.prepare import prepare_until, work_folder
+
+    out, alone = cache / "prepared" / name, cache / "alone" / f"{name}.mp4"
+    alone.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(recording(name), alone)  # masks may lie beside it, and would be taken
+    prepare_until("estimates", alone, out, object="none", estimators="offline", yes=True)
+    found = last_kept(work_folder(out), "estimates")["estimates"]
+    masks = np.stack([found.masks.human[i] for i in range(len(found.masks.human))])
+    arrays = {}
+    for person, track in found.landmarks.items():
+        image = track.image.numpy()
+        arrays[f"lm {person}"] = np.zeros((*image.shape[:2], 4), np.float32)
+        arrays[f"lm {person}"][..., [0, 1, 3]] = image
+    np.savez_compressed(file, m=np.packbits(masks, axis=-1), shape=masks.shape, **arrays)
+
+
 def estimates_of(name: str, cache: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """The person's masks [F, H, W] and landmarks [F, 33, 4] (x, y, 0, visibility)."""
-    file = cache / f"{name}.npz"
-    if not file.is_file():
-        from hoigs.preparation.kept import last_kept
-        from hoigs.preparation.prepare import prepare_until, work_folder
-
-        out, alone = cache / "prepared" / name, cache / "alone" / f"{name}.mp4"
-        alone.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(recording(name), alone)  # masks may lie beside it, and would be taken
-        prepare_until("estimates", alone, out, object="none", estimators="offline", yes=True)
-        found = last_kept(work_folder(out), "estimates")["estimates"]
-        masks = np.stack([found.masks.human[i] for i in range(len(found.masks.human))])
-        arrays = {}
-        for person, track in found.landmarks.items():
-            image = track.image.numpy()
-            arrays[f"lm {person}"] = np.zeros((*image.shape[:2], 4), np.float32)
-            arrays[f"lm {person}"][..., [0, 1, 3]] = image
-        np.savez_compressed(file, m=np.packbits(masks, axis=-1), shape=masks.shape, **arrays)
-    with np.load(file) as kept:
+    prepare(name, cache)
+    with np.load(cache / f"{name}.npz") as kept:
         masks = np.unpackbits(kept["m"], axis=-1)[..., : kept["shape"][2]].astype(bool)
         tracks = [kept[k] for k in kept.files if k.startswith("lm ")]
     return masks, tracks[0] if tracks else None
@@ -581,6 +587,8 @@ def main() -> None:
     print("| case | right | partial | wrong | said | empty | click | IoU | s | states |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     with ProcessPoolExecutor(args.jobs) as pool:
+        recordings = {CASES[name].recording for name in names}
+        list(pool.map(prepare, recordings, [args.cache] * len(recordings)))  # once each
         for row in pool.map(task, names, [args.cache] * len(names), [last] * len(names)):
             rows.append(row)
             if "error" in row:
