@@ -20,7 +20,6 @@ from hoigs.core.interfaces.body import PELVIS
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import POSES_ESTIMATED, BodyTrack
 from hoigs.core.values.world import World
-from hoigs.preparation.body.limbs import guessed_limbs
 from hoigs.preparation.cameras.camera_track import angular_factor, full_factor, parallax
 from hoigs.preparation.depth import DepthSource
 from hoigs.preparation.draft import Draft
@@ -175,13 +174,7 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
                 round(one.distance(draft.cameras), 3),
                 one.report["size_from"],
                 one.unseen,
-                guessed_limbs(
-                    draft.body,
-                    one.poses,
-                    draft.undistorted.landmarks[name].without(~torch.from_numpy(one.found)),
-                    draft.cameras,
-                    draft.masks.moving,
-                ),
+                draft.guessed[name],
             )
             for name, one in draft.bodies.items()
         },

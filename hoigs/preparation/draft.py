@@ -17,6 +17,7 @@ from hoigs.core.interfaces.estimator import FramePrompt
 from hoigs.core.values.camera import Camera
 from hoigs.preparation.body.body_files import FileBody
 from hoigs.preparation.body.fit_problem import Observations
+from hoigs.preparation.body.limbs import guessed_limbs
 from hoigs.preparation.cameras.camera_track import CameraTrack
 from hoigs.preparation.depth import DepthFit
 from hoigs.preparation.estimates.reader import FoundObject, FrameEstimates, GivenMasks
@@ -45,7 +46,8 @@ class Draft:
         announce: called with what the user should read before a long stage.
         frames: the chosen ones. video: reads them; of frames with a camera alone, once cameras are
             known. clicks: prompts of the options, each with its frame.
-        people: names of those who are followed. boxes: of people whom no click shows.
+        people: names of those who are fitted. boxes: of people whom no click shows. beside: of
+            people who are followed and not fitted.
         estimates: landmarks and masks as found, distortion still in. found_object: masks of an
             estimator of objects alone.
         track: cameras in their own unit.
@@ -69,6 +71,7 @@ class Draft:
     clicks: Mapping[str, Prompt] = field(default_factory=dict)
     people: tuple[str, ...] = ()
     boxes: dict[str, FramePrompt] = field(default_factory=dict)
+    beside: dict[str, FramePrompt] = field(default_factory=dict)
     estimates: FrameEstimates = _LATER
     found_object: FoundObject | None = None
     track: CameraTrack = _LATER
@@ -106,7 +109,8 @@ class Draft:
     @property
     def prompts(self) -> dict[str, Prompt]:
         """Where, or what, each entity is: clicks, and boxes of people who were found."""
-        boxes = {name: Prompt(box=at.box, frame=at.frame) for name, at in self.boxes.items()}
+        found = {**self.boxes, **self.beside}
+        boxes = {name: Prompt(box=at.box, frame=at.frame) for name, at in found.items()}
         return {**self.clicks, **boxes}
 
     @property
@@ -118,6 +122,18 @@ class Draft:
     def cameras(self) -> list[Camera]:
         """Of each frame, in metres."""
         return [camera.scaled(self.unit.metres) for camera in self.track.cameras]
+
+    @cached_property
+    def guessed(self) -> dict[str, dict[str, list[int]]]:
+        """Of each person and limb, the frames in which its pose is a guess."""
+        return {
+            name: guessed_limbs(
+                self.body, one.poses,
+                self.undistorted.landmarks[name].without(~torch.from_numpy(one.found)),
+                self.cameras, self.masks.moving,
+            )
+            for name, one in self.bodies.items()
+        }  # fmt: skip
 
     def observations(self) -> dict[str, Observations]:
         """What each person's body is fitted to, the first one's first."""
@@ -146,7 +162,7 @@ class Draft:
         """Undistorted masks of the source, with those that were found of the object alone."""
         given, found = self.undistorted.masks, self.found_object
         if not options.find_object:
-            return GivenMasks(human=given.persons(None))
+            return GivenMasks(human=given.persons(None), beside=given.beside)
         if found is None:
             return given
         undistort = self.track.undistort

@@ -26,6 +26,7 @@ BLACK = 2  # of 255: a lens and a codec never leave a real surface this dark and
 NEARLY_BLACK = 16  # the codec's ringing at the border of what was painted
 SMALLEST = 5e-4  # of the image
 BORDER = 2  # pixels that the border mixes
+ALWAYS = 0.9  # of the frames: what people hide in more of them shows nothing else
 
 
 def blank_pixels(
@@ -435,11 +436,29 @@ def final_masks(
             human, object_masks, further = _further(human, object_masks, found, track)
     things = [object_masks, *further.values()]
     people = without_others(others, human, things)
-    shown = [human, *people.values(), *things]
-    blank = _nothing(human) if keep_black else _blank(sources.images, shown)
+    shown, beside = [human, *people.values(), *things], sources.given.beside
+    known = shown if beside is None else [*shown, beside]
+    blank = _nothing(human) if keep_black else _blank(sources.images, known)
     if (outside := track.undistort.outside) is not None:
         blank = MaskStack(mask | outside for mask in blank)
+    if beside is not None:
+        blank = _with_people(blank, beside, shown, still=track.static)
     return EntityMasks(human, object_masks, blank, further, people), text
+
+
+def _with_people(
+    blank: MaskStack, beside: MaskStack, shown: Sequence[MaskStack], *, still: bool
+) -> MaskStack:
+    """Blank pixels, and those of people who are not fitted: but, before a still camera, what they
+    hide in nearly all frames is the scene there, as nothing else is seen of it."""
+    often = np.zeros(beside[0].shape, np.int32)
+    for mask in beside if still else ():
+        often += mask
+    always = often > ALWAYS * len(beside)
+    return MaskStack(
+        mask | (other & ~always & ~np.logical_or.reduce(rows))
+        for mask, other, *rows in zip(blank, beside, *shown, strict=True)
+    )
 
 
 def _further(
@@ -473,9 +492,14 @@ def _blank(images: Images, entities: Sequence[MaskStack]) -> MaskStack:
     )
 
 
-def blank_warning(blank: MaskStack, outside: Bool[np.ndarray, "H W"] | None) -> list[str]:
-    """A sentence, if any pixel is blank that is not `outside` of what the lens shows."""
+def blank_warning(
+    blank: MaskStack, outside: Bool[np.ndarray, "H W"] | None, beside: MaskStack | None = None
+) -> list[str]:
+    """A sentence, if any pixel is blank that is not `outside` of what the lens shows, and not of
+    people `beside` those who are fitted."""
     patches = blank if outside is None else MaskStack(mask & ~outside for mask in blank)
+    if beside is not None:
+        patches = MaskStack(mask & ~other for mask, other in zip(patches, beside, strict=True))
     coverage = patches.coverage()
     if not coverage.any():
         return []

@@ -59,7 +59,7 @@ PLAN = {
         ("frames",),
         ("human_name", "further_people", "find_person", "everybody", "object_name"),
         slow=True,
-        version=4,
+        version=5,
     ),
     "object_masks": Stage(
         30, ("estimates",), ("object_name", "further_objects"), slow=True, version=8
@@ -77,7 +77,7 @@ PLAN = {
         slow=True,
         version=10,
     ),
-    "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True, version=2),
+    "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True, version=3),
     "objects": Stage(
         40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=4
     ),

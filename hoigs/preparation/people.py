@@ -361,39 +361,48 @@ def _share(progress: Callable[[float], None], count: int, number: int, done: flo
 
 
 SMALL = 0.5  # of the picture's height: a smaller person is followed by the box about them
+BESIDE = 3  # people are followed besides those who are fitted, which takes as long for each
 
 
 def chosen_people(
     options: PrepareOptions, found: Sequence[FramePrompt], height: int
-) -> tuple[dict[str, FramePrompt], str]:
-    """The first one found, or all, by name, and a sentence that says so; nobody, and "", where
-    one is found who is as large as most, and whom any look at the whole picture finds.
+) -> tuple[dict[str, FramePrompt], dict[str, FramePrompt], str]:
+    """The first one found, or all, by name; those who are not chosen, likewise; and a sentence that
+    says so. Nobody, and "", where one is found who is as large as most, and whom any look at the
+    whole picture finds.
 
     Args:
         height: of the picture, pixels.
     """
     if not found:
-        return {}, ""
+        return {}, {}, ""
     if len(found) == 1:
         at, share = found[0], _tall(found[0]) / height
         if share > SMALL:
-            return {}, ""
-        return {options.human_name: at}, (
-            f"the person seen in frame {at.frame}, at {_middle(at)}, is small (about "
-            f"{100 * share:.0f} % of the picture's height) and followed from there (--person "
-            "X,Y@FRAME chooses another); limbs of people so small are known less well"
+            return {}, {}, ""
+        return (
+            {options.human_name: at},
+            {},
+            (
+                f"the person seen in frame {at.frame}, at {_middle(at)}, is small (about "
+                f"{100 * share:.0f} % of the picture's height) and followed from there (--person "
+                "X,Y@FRAME chooses another); limbs of people so small are known less well"
+            ),
         )
-    taken = found if options.everybody else found[:1]
-    names = [options.human_name, *(f"{options.human_name}{k + 2}" for k in range(len(taken) - 1))]
-    boxes = dict(zip(names, taken, strict=True))
+    names = [options.human_name, *(f"{options.human_name}{k + 2}" for k in range(len(found) - 1))]
+    boxes = dict(zip(names, found, strict=True))
     places = ", ".join(_middle(at) for at in found)
     said = f"{len(found)} people are seen in frame {found[0].frame}, at {places}: "
     if options.everybody:
-        return boxes, said + f"all are fitted, as {', '.join(names)}"
-    return boxes, said + (
+        return boxes, {}, said + f"all are fitted, as {', '.join(names)}"
+    chosen = {names[0]: boxes.pop(names[0])}
+    beside = dict(list(boxes.items())[:BESIDE])
+    said += (
         f"the one at {_middle(found[0])} is fitted (--person X,Y@FRAME chooses another, several "
-        "with names, --person anna=X,Y; --person all takes everybody)"
+        "with names, --person anna=X,Y; --person all takes everybody); what others cover is left "
+        "out of training and scores, and is no object"
     )
+    return chosen, beside, said
 
 
 def _tall(at: FramePrompt) -> float:

@@ -193,7 +193,9 @@ def estimates(
                 raise
             said = f"{error}; so the clip has the object alone (--person X,Y@FRAME shows somebody)"
             draft.announce(said)
-            chosen = chosen.noting([said], unknown={"people": str(error)}, people=(), boxes={})
+            chosen = chosen.noting(
+                [said], unknown={"people": str(error)}, people=(), boxes={}, beside={}
+            )
             reader = _reader(chosen, options, estimators)
             found = reader.landmarks_and_masks(progress)
         return chosen.noting(reader.notes_on_person(), estimates=found)
@@ -203,8 +205,8 @@ def estimates(
 
 def _reader(draft: Draft, options: PrepareOptions, estimators: Estimators) -> EstimateReader:
     return EstimateReader(
-        draft.source, draft.video, draft.people, draft.prompts, options, estimators,
-        draft.work.root / "estimators",
+        draft.source, draft.video, draft.people, tuple(draft.beside), draft.prompts, options,
+        estimators, draft.work.root / "estimators",
     )  # fmt: skip
 
 
@@ -214,11 +216,11 @@ def _choose_people(draft: Draft, options: PrepareOptions, estimators: Estimators
     if not options.people or any(name in draft.clicks for name in options.people):
         return draft
     found = _reader(draft, options, estimators).seen()
-    boxes, said = chosen_people(options, found, draft.video.native_height)
+    boxes, beside, said = chosen_people(options, found, draft.video.native_height)
     if not said:
         return draft
     draft.announce(said)
-    return draft.noting([said], people=tuple(boxes), boxes=boxes)
+    return draft.noting([said], people=tuple(boxes), boxes=boxes, beside=beside)
 
 
 def _shown(draft: Draft, *names: str) -> dict[str, Any]:
@@ -238,7 +240,7 @@ def object_masks(
     estimator, inputs = estimators.get("object"), None
     if estimator is not None:
         files = fingerprint(paths_of(estimator, draft.source.folder))
-        names = (*draft.people, *options.objects)
+        names = (*draft.people, *draft.beside, *options.objects)
         inputs = [identity(estimator), files, _shown(draft, *names)]
 
     def make() -> Draft:
@@ -343,7 +345,9 @@ def masks(
             sources, draft.undistorted.further, draft.found_object, draft.track,
             keep_black=options.keep_black,
         )  # fmt: skip
-        warnings = blank_warning(found.blank, draft.track.undistort.outside)
+        warnings = blank_warning(
+            found.blank, draft.track.undistort.outside, draft.undistorted.masks.beside
+        )
         return draft.noting(warnings, {"masks": text}, masks=found)
 
     return kept(draft, "masks", options, make)

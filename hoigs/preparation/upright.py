@@ -27,6 +27,7 @@ ALL = 0.9  # of the draws lie in the interval
 DISTINCT = 3.0  # times as many edges as point to where most tilts and rolls have the vertical
 CLEAR = 6.0  # degrees: a wider interval tells nothing
 FRAMES = 3
+LEGS, LEGS_GUESSED = ("left leg", "right leg"), 0.5  # of the frames
 LEAN = 30.0  # degrees that somebody's trunk may lean, on average: beyond, lines are not vertical
 
 
@@ -45,7 +46,12 @@ def world_of(draft: Draft, focal_range: tuple[float, float] | None) -> World:
     Args:
         focal_range: shortest and longest focal length that is possible, as shares of the cameras'.
     """
-    people = [(draft.body, person.poses) for person in draft.bodies.values()]
+    count = len(draft.video)
+    people = [
+        (draft.body, person.poses)
+        for name, person in draft.bodies.items()
+        if all(len(draft.guessed[name][leg]) < LEGS_GUESSED * count for leg in LEGS)
+    ]  # legs that nothing shows are drawn straight, as of somebody who stands
     stood = world_of_people(people, draft.video.fps) if people else None
     if stood is not None and stood.known == "floor":
         return stood

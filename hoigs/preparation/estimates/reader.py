@@ -82,13 +82,14 @@ def chosen_landmarks(
 
 @dataclass(frozen=True)
 class GivenMasks:
-    """Masks as the source has them: together, or the person's and perhaps the object's apart; and
-    those of further people, all in one."""
+    """Masks as the source has them: together, or the person's and perhaps the object's apart; those
+    of further people, all in one; and those of people `beside` them, who are not fitted."""
 
     together: MaskStack | None = None
     human: MaskStack | None = None
     object: MaskStack | None = None
     others: MaskStack | None = None
+    beside: MaskStack | None = None
 
     def named(self) -> dict[str, MaskStack]:
         """Those that there are, by the name of the field."""
@@ -183,13 +184,15 @@ class EstimateReader:
     """Runs the estimator of each kind: a given one, or that of the files beside the video.
 
     Attributes:
-        people, prompts: who is followed, and where or what each entity is.
+        people, beside: who is followed, and who besides and is not fitted.
+        prompts: where or what each entity is.
         work: folder for what estimators keep between runs.
     """
 
     source: Source
     video: Frames
     people: tuple[str, ...]
+    beside: tuple[str, ...]
     prompts: Mapping[str, Prompt]
     options: PrepareOptions
     estimators: Estimators
@@ -202,13 +205,13 @@ class EstimateReader:
         first, *further = self.people
         landmarks = {name: self._landmarks(name, progress) for name in self.people}
         masks = self._masks((first, self.options.object_name), progress)
-        if not further:
+        if not further and not self.beside:
             return FrameEstimates(landmarks, masks)
         found = self.estimate("masks", progress).masks
         assert found is not None  # `checked` saw to it
         stacks = {name: self._stack(self._given(found, name)) for name in further}
-        together = zip(*stacks.values(), strict=True)
-        masks = replace(masks, others=MaskStack(np.logical_or.reduce(rows) for rows in together))
+        beside = [self._stack(self._given(found, name)) for name in self.beside]
+        masks = replace(masks, others=_all_of([*stacks.values()]), beside=_all_of(beside))
         return FrameEstimates(landmarks, masks, stacks)
 
     def _given(self, found: EntityMasks, name: str) -> FrameArrays:
@@ -342,7 +345,7 @@ class EstimateReader:
 
     def _entities(self, kind: Place) -> tuple[EntityRequest, ...]:
         options = self.options
-        people = tuple(self._asked(name, "human") for name in self.people)
+        people = tuple(self._asked(name, "human") for name in (*self.people, *self.beside))
         thing = self._asked(options.object_name, "object")
         if kind == "object":
             return (thing, *(self._asked(n, "object") for n in options.further_objects))
@@ -394,6 +397,13 @@ class EstimateReader:
     def _stack(self, masks) -> MaskStack:
         size = (self.video.width, self.video.height)
         return MaskStack(resized_mask(masks[number], size) for number in self.video.indices)
+
+
+def _all_of(stacks: Sequence[MaskStack]) -> MaskStack | None:
+    """Pixels of any of several; None where there is none."""
+    if not stacks:
+        return None
+    return MaskStack(np.logical_or.reduce(rows) for rows in zip(*stacks, strict=True))
 
 
 def identity(estimator: Estimator) -> list[str]:

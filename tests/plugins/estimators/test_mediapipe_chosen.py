@@ -21,6 +21,11 @@ MARKS = {11: (12, -30), 12: (-12, -30), 13: (20, 0), 14: (-20, 0), 15: (20, 20),
          23: (8, 20), 24: (-8, 20), 27: (8, 60), 28: (-8, 60)}  # fmt: skip
 
 
+def guesses(x0: int) -> list[Box]:
+    """33 landmarks that are not seen, on the person: the network supposes a place of all."""
+    return [Box(x=x0 / WIDTH, y=0.25 + (i > 10) / 4, z=0.0, visibility=0.0) for i in range(33)]
+
+
 class Graph:
     """Two people of which it finds the one nearer to the square's middle, as sure as it covers
     them; the image's first value is how far both have walked to the right."""
@@ -30,7 +35,7 @@ class Graph:
         walked = int(image[0, 0, 0])
         middle = square.x_center * WIDTH
         x0 = min((LEFT + walked, RIGHT + walked), key=lambda x: abs(x - middle))
-        points = [Box(x=-1.0, y=-1.0, z=0.0, visibility=0.0) for _ in range(33)]
+        points = guesses(x0)
         for mark, (x, y) in MARKS.items():
             inside = abs(x0 + x - middle) < square.width * WIDTH / 2
             points[mark] = Box(x=(x0 + x) / WIDTH, y=(90 + y) / HEIGHT, z=0.0, visibility=inside)
@@ -91,7 +96,7 @@ class Crossing:
         red, blue = self.places
         x0 = min(self.places, key=lambda x: abs(x - middle))
         x0 = red if abs(red - blue) < 25 else x0  # the other one is hidden
-        points = [Box(x=-1.0, y=-1.0, z=0.0, visibility=0.0) for _ in range(33)]
+        points = guesses(x0)
         for mark, (x, y) in MARKS.items():
             points[mark] = Box(x=(x0 + x) / WIDTH, y=(90 + y) / HEIGHT, z=0.0, visibility=0.9)
         mask = np.zeros((HEIGHT, WIDTH), np.float32)

@@ -55,14 +55,20 @@ def draft(image: np.ndarray, camera: Camera, trunk: np.ndarray | None) -> Simple
     people = {} if trunk is None else {"human": SimpleNamespace(joints=joints, poses=None)}
     return SimpleNamespace(
         video=frames, cameras=[camera] * 3, bodies=people, body=None,
+        guessed={"human": {"left leg": [], "right leg": [0, 1, 2]}},
         masks=SimpleNamespace(moving=lambda i: NOTHING),
         track=SimpleNamespace(undistort=Undistortion()),
     )  # fmt: skip
 
 
+def no_legs(people: list, fps: float) -> None:
+    """Nobody stands on legs that are guessed."""
+    assert len(people) == 0
+
+
 def test_lines_are_believed_beside_somebody_upright(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mat that is seen from above has lines that look vertical."""
-    monkeypatch.setattr("hoigs.preparation.upright.world_of_people", lambda people, fps: None)
+    monkeypatch.setattr("hoigs.preparation.upright.world_of_people", no_legs)
     monkeypatch.setattr("hoigs.preparation.upright.FRAMES", 1)
     image, camera, true = room(20, 0)
     lean = Rotation.from_euler("x", 15, degrees=True).apply(true)

@@ -11,6 +11,7 @@ import json
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import (
     EntityMasks,
+    EntityRequest,
     EstimateKind,
     Estimates,
     Estimator,
@@ -104,6 +106,8 @@ IMPORTED = [SCRIPT.with_name(f"mediapipe_{part}.py") for part in PARTS]
 INSTALL = "run `hoigs estimators install mediapipe` and leave `python` out"
 OTHERS, FOLLOWED = 0.1, 0.8  # shares of the frames, above and below which there is something to say
 LOOKS = 7  # frames that are looked at for several people, less one
+CERTAIN = 0.75  # of these, that show the same person where a way through all frames leads
+HERE = 0.25  # of the side of the square about somebody: their hips are the same
 HIPS = [23, 24]  # of the 33 landmarks
 SMALL = 0.6  # of the image's height: side of the square about a person, believed if seen twice
 LONGEST = 1280  # pixels: larger frames are made smaller, which the models do in any case
@@ -184,22 +188,15 @@ class MediapipeEstimator(Estimator):
 
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Estimates:
         people = video.named("human") or ("human",)
-        first = min(video.numbers, default=0)
-        given = range(first, max(video.numbers, default=-1) + 1)
+        given = range(min(video.numbers, default=0), max(video.numbers, default=-1) + 1)
         order, chosen = _order(given, video)
-        settings = {"pose": self._settings(), "frames": len(given), "masks": self.config.masks}
-        settings |= {"first": first} if first else {}
-        settings |= {"people": chosen} if chosen else {}
-        # what other versions of the scripts found is not taken
-        settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, *IMPORTED)]
-        out = video.work / f"mediapipe-{settings_key(settings)}.npz"
-        if not out.is_file():
-            self._run(self._python(video), out, order, chosen, video, progress)
-        with np.load(out, allow_pickle=False) as file:
-            found = {name: file[name] for name in file.files}
+        clicked, looked = chosen is not None, None
+        if not clicked:
+            looked = self._by_looks(video, given, progress)
+        out, found = looked or self._found(order, chosen, video, given, progress)
         progress(1.0, "landmarks")
         text = f"MediaPipe Pose, complexity {self._complexity()}"
-        text += ", of the person clicked on" if chosen else ""
+        text += ", of the person clicked on" if clicked else ""
         landmarks = {}
         for k, name in enumerate(people):
             image = self._spread(found["image_xyzv"][k], given, video)
@@ -214,21 +211,67 @@ class MediapipeEstimator(Estimator):
         frames = _frames(video, given, progress, "masks")
         persons, still, changed = steadied(out, found["person"], found["size"], frames, video)
         masks = {
-            name: frames_of(persons[k], found["size"], first, video)
+            name: frames_of(persons[k], found["size"], given.start, video)
             for k, name in enumerate(people)
         }
         text = "MediaPipe's segmentation of poses, its outline refined by that of selfies"
         text += "; the same wherever frames of the still camera are" if still else ""
-        text += "; of the person clicked on" if chosen else ""
+        text += "; of the person clicked on" if clicked else ""
         images = {name: track.image_xyzv for name, track in landmarks.items()}
-        notes = _lost(given, images) if chosen else _others(found["several"], images[people[0]])
-        if not chosen:
+        notes = _lost(given, images) if clicked else _others(found["several"], images[people[0]])
+        if not clicked:
             empty = ~found["person"][0].any((1, 2))
             notes += _without_pose(found["alone"], empty, given, video.numbers)
         notes += _changed(np.atleast_1d(changed.any(0)), given, video.numbers)
         return Estimates(EntityMasks(masks, None, text, notes=notes), landmarks)
 
+    def _found(
+        self, order: Sequence[int], chosen: dict[str, Any] | None, video: VideoRequest,
+        given: range, progress: Progress,
+    ) -> tuple[Path, dict[str, np.ndarray]]:  # fmt: skip
+        """The script's file, and what is in it."""
+        settings = {"pose": self._settings(), "frames": len(given), "masks": self.config.masks}
+        settings |= {"first": given.start} if given.start else {}
+        settings |= {"people": chosen} if chosen else {}
+        # what other versions of the scripts found is not taken
+        settings["scripts"] = [zlib.crc32(path.read_bytes()) for path in (SCRIPT, *IMPORTED)]
+        out = video.work / f"mediapipe-{settings_key(settings)}.npz"
+        if not out.is_file():
+            self._run(self._python(video), out, order, chosen, video, progress)
+        with np.load(out, allow_pickle=False) as file:
+            return out, {name: file[name] for name in file.files}
+
+    def _by_looks(
+        self, video: VideoRequest, given: range, progress: Progress
+    ) -> tuple[Path, dict[str, np.ndarray]] | None:
+        """What is found by following the square about the person whom most looks show: nearer to
+        the truth than the detector's way from frame to frame, which smooths and so lags. None where
+        few looks show anybody, or several people, or they are not where the way leads."""
+        rows, shown = self._looks(video)
+        seen = _together(rows, shown, video)
+        if len(seen) != 1 or len(set(rows[:, 0])) < CERTAIN * len(shown):
+            return None
+        human = EntityRequest("human", "human", box=seen[0].box, frame=seen[0].frame)
+        order, chosen = _order(given, replace(video, entities=(human,)))
+        try:
+            out, found = self._found(order, chosen, video, given, progress)
+        except HoigsError:
+            return None  # nobody is found again there: said of the other way, if it fails as well
+        image = self._spread(found["image_xyzv"][0], given, video)
+        if np.isfinite(image[given, 0, 0]).mean() < FOLLOWED:
+            return None
+        there = [
+            np.linalg.norm(image[shown[int(place)], HIPS, :2].mean(0) - (x, y)) < HERE * side
+            for place, _, x, y, side in rows.tolist()
+        ]
+        return (out, found) if np.mean(there) >= CERTAIN else None
+
     def people(self, video: VideoRequest) -> tuple[FramePrompt, ...]:
+        rows, shown = self._looks(video)
+        return _together(rows, shown, video)
+
+    def _looks(self, video: VideoRequest) -> tuple[Float[np.ndarray, "N 5"], list[int]]:
+        """Who is seen in a few frames, as `mediapipe_script.Lookout` has it, and which they are."""
         numbers = video.numbers
         shown = sorted({numbers[i * (len(numbers) - 1) // LOOKS] for i in range(LOOKS + 1)})
         settings = {"pose": self._settings(), "look": shown}
@@ -237,7 +280,7 @@ class MediapipeEstimator(Estimator):
         if not out.is_file():
             self._run(self._python(video), out, shown, None, video, no_progress, look=True)
         with np.load(out, allow_pickle=False) as file:
-            return _together(file["people"], shown, video)
+            return file["people"], shown
 
     def _python(self, video: VideoRequest) -> Path:
         if self.config.python is None:

@@ -2,22 +2,24 @@
 
 MediaPipe's detector takes whom it likes. Its model of landmarks is therefore shown the square
 about the person clicked on, found in that frame and followed from there (`mediapipe_people.py`).
+As in MediaPipe's own graph the next square is that about the hips with all limbs, guessed ones too:
+one about those that are seen leaves out legs behind a table, sees less, and is smaller again.
 It imports nothing of hoigs.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from mediapipe_check import hips_square
 from mediapipe_guided import KEPT, score, seen_in
 
 SIZES = (0.4, 0.6, 0.9, 1.3, 1.8)  # sides of the squares, in longer sides of the image
 SHIFTS = (-0.3, 0.0, 0.3)  # of the click from their middles, in sides: up, on and down the person
 ON = 0.5  # of the person's own mask, at a click
 SEEN = 0.5  # visibility
-MARGIN = 1.25  # of the landmarks' box, the next square
-STEADY, SHRINKS = 0.7, 0.95  # shares of its last side that a square keeps as it grows, or shrinks
+MARGIN = 1.25  # of a box about them, the first square
+STEADY = 0.5  # share of its last side that a square keeps
 WIDER = (1.0, 1.4)  # sides in which someone who is lost is looked for
-WHOLE, MORE = (1.8, 0.0, 0.4), 2  # sides of a square for limbs, and down; landmarks worth it
 SAME = 0.08  # in sides, mean distance of landmarks of one and the same person
 JUMP, GROWTH = 0.35, 1.6  # in sides, from frame to frame: what moves or grows more is someone else
 
@@ -48,32 +50,21 @@ class ChosenPose:
             raise LookupError(f"no person is found there: {number}")
         return found
 
-    def followed(self, image, doubt=False):
-        """The same of the person in the square; None where they are lost.
-
-        Args:
-            doubt: look in a wider square, too, and take it if it shows more of them.
-        """
+    def followed(self, image):
+        """The same of the person in the square; None where they are lost."""
         x, y, side = self.square
         found = None
         for wider in WIDER:
             found = self.look(image, (x, y, wider * side))
             if found is None:
                 continue
-            x1, y1, side1 = square_of(found[0])
+            x1, y1, side1 = hips_square(found[0])
             if np.hypot(x1 - x, y1 - y) < JUMP * side and 1 / GROWTH < side1 / side < GROWTH:
                 break
             found = None
         if found is None:
             return None
-        # quickly smaller, it would leave a limb out, see less, and be smaller again
-        kept = STEADY if side1 > side else SHRINKS
-        square = (x1, y1, kept * side + (1 - kept) * side1)
-        for down in WHOLE[1:] if doubt else ():
-            whole = self.look(image, (x1, y1 + down * side, WHOLE[0] * side))
-            if whole is not None and shows_more(whole[0], found[0], side):
-                return square_of(whole[0]), whole
-        return square, found
+        return (x1, y1, STEADY * side + (1 - STEADY) * side1), found
 
     def take(self, square):
         """This is where the person is."""
@@ -102,14 +93,14 @@ class ChosenPose:
             if found is None or not self.agrees(found[2], inside, outside):
                 continue
             # the same once more, in the square that it will be followed in
-            closer = self.look(image, square_of(found[0]))
+            closer = self.look(image, hips_square(found[0]))
             if closer is None or not self.agrees(closer[2], inside, outside):
                 if box is None:
                     continue
                 closer = found  # seen in the box that was drawn about them
             value = closer[0][:, 3].mean()  # more of the person
             if best is None or value > best[0]:
-                best = value, square_of(closer[0]), closer
+                best = value, hips_square(closer[0]), closer
         return None if best is None else best[1:]
 
     def agrees(self, mask, inside, outside) -> bool:
@@ -130,23 +121,9 @@ class ChosenPose:
         return found
 
 
-def shows_more(points, others, side) -> bool:
-    """Whether landmarks are those of the same person, and more of them."""
-    more = (points[:, 3] > SEEN).sum() > (others[:, 3] > SEEN).sum() + MORE
-    return bool(more and same(points, others, side))
-
-
 def same(points, others, side) -> bool:
     """Whether landmarks are of one person, by those that are seen in both."""
     both = (points[:, 3] > SEEN) & (others[:, 3] > SEEN)
     if both.sum() < 4:
         return False
     return bool(np.linalg.norm((points - others)[both, :2], axis=1).mean() < SAME * side)
-
-
-def square_of(points):
-    """The square about the landmarks that are seen."""
-    seen = points[points[:, 3] > SEEN, :2]
-    low, high = seen.min(0), seen.max(0)
-    x, y = (low + high) / 2
-    return float(x), float(y), float(MARGIN * max(*(high - low), 8))

@@ -9,8 +9,8 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-from mediapipe_check import UNLIKE, difference
-from mediapipe_chosen import same, square_of
+from mediapipe_check import UNLIKE, difference, hips_square
+from mediapipe_chosen import same
 from mediapipe_guided import HEAD, KEPT, SHOULDERS, landmark_graph, score, seen_in, upright
 
 GRAPH = """
@@ -25,6 +25,7 @@ node {
 SQUARES, ROWS = (0.7, 1.1, 1.6), (0.35, 0.7)  # sides and middles of squares, in image heights
 SURE, BROAD = 0.9, 0.1  # mean visibility of shoulders and arm, without a face; their distance
 MINE = 0.35  # of the square's side from somebody's hips, along the image: it is them
+ONE_PLACE = 0.2  # the same between middles of hips: less than people who stand side by side
 FAINT = 0.5  # of the sureness of a person without a face: others come first
 TILES, OVERLAP = (0.6, 0.35), 0.4  # sides of squares for the detector, in image heights; of a side
 CLEAR = 0.85  # of the detector, in such a square: of posts, trunks and leaves it is less sure
@@ -52,9 +53,16 @@ class Look:
                 found.append((sure, *square))
         return found
 
+    def with_small(self, image, found):
+        """Those found, and whom `small` finds elsewhere."""
+        return found + [
+            one for one in self.small(image)
+            if not any(same_place(one[1:], other[1:]) for other in found)
+        ]  # fmt: skip
+
     def small(self, image):
-        """The same of those who are too small for the detector in the whole image: it is shown
-        squares all over it."""
+        """The same of those whom the detector misses in the whole image, as they are small or it
+        takes another: it is shown squares all over it."""
         height, width = image.shape[:2]
         found: list[tuple[float, float, float, float]] = []
         for side in (round(share * height) for share in TILES):
@@ -68,7 +76,7 @@ class Look:
             seen = seen_in(*self.landmarks, image, square)
             if seen is None or score(seen[0][:, 3]) < KEPT:
                 continue
-            square = square_of(seen[0])  # in which they are followed
+            square = hips_square(seen[0])  # in which they are followed
             again = seen_in(*self.landmarks, image, square)
             if again is None or not same(seen[0], again[0], square[2]):
                 continue
@@ -131,7 +139,7 @@ def near(one, other) -> bool:
 def same_place(one, other) -> bool:
     """Whether two squares, x and y of the middle and the side, are of one person."""
     apart = np.hypot(one[0] - other[0], one[1] - other[1])
-    return bool(apart < MINE * max(one[2], other[2]))
+    return bool(apart < ONE_PLACE * max(one[2], other[2]))
 
 
 def starts(length, side):

@@ -10,16 +10,16 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from mediapipe_chosen import ON, ChosenPose, same, square_of
+from mediapipe_check import hips_square
+from mediapipe_chosen import ON, ChosenPose, same
 
 LEVELS = 6  # of each of red, green and blue, by which clothes are compared
-HIPS, UPPER = [23, 24], slice(0, 13)  # landmarks; of the head and shoulders
+HIPS = [23, 24]  # landmarks
 APART = 0.6  # in sides, of the squares' middles: what is seen of each is theirs alone
 UNLIKE = 0.08  # difference of similarities (0 to 1) from which clothes tell people apart
 RENEWED = 0.03  # share of the newest frame in how a person looks
-SHRUNK = 0.75  # of the usual side: a square that leaves part of the person out
 DRAWN = 0.9  # of the last step, the next one of a person who is lost
-AGAIN = 5  # frames between searches: for the lost, and for limbs that the square leaves out
+AGAIN = 5  # frames between searches for the lost
 LEAST, STEP = 0.5, 0.35  # of a search for the lost: similarity, and step in sides
 
 
@@ -30,28 +30,11 @@ class Person:
         self.pose = ChosenPose(graph, rect, prompts)
         self.begin = min(prompts)
         self.looks: np.ndarray | None = None
-        self.side = 0.0  # usual one of the square
         self.step = np.zeros(2)  # pixels a frame
         self.lost = 0  # frames
 
     def expected(self):
         return np.array(self.pose.square[:2]) + self.step
-
-    def whole(self):
-        """The square, downwards to its usual size if it has shrunk to the head and the chest."""
-        x, y, side = self.pose.square
-        return x, y + max(0.0, self.side - side) / 2, max(side, self.side)
-
-    def mended(self, image, followed):
-        """What a square shows, or more of the same person where it has shrunk."""
-        if followed is None or followed[0][2] > SHRUNK * self.side:
-            return followed
-        (x, y, side), found = followed
-        more = self.pose.look(image, (x, y + (self.side - side) / 2, self.side))
-        if more is None or not same(more[0][UPPER], found[0][UPPER], self.side):
-            return followed
-        square = square_of(more[0])
-        return (square, more) if square[2] > side else followed
 
     def take(self, square):
         """Whose place is known; a later step begins here."""
@@ -135,9 +118,7 @@ class People:
         """Square and what is seen of a person, by the prompt or in their square."""
         person = self.people[name]
         prompted = number in person.pose.prompts
-        begun = person.pose.first is not None
-        followed = person.pose.followed(image, number % AGAIN == 0) if begun else None
-        followed = person.mended(image, followed)
+        followed = person.pose.followed(image) if person.pose.first is not None else None
         if not prompted:
             return followed
         try:
@@ -179,13 +160,13 @@ class People:
         person = self.people[name]
         if len(self.people) < 2 or person.lost % AGAIN or person.looks is None:
             return None
-        _, y, side = person.whole()
+        _, y, side = person.pose.square
         best = None
         for x in np.arange(STEP * side / 2, image.shape[1], STEP * side):
             found = person.pose.look(image, (float(x), y, side))
             if found is None:
                 continue
-            place = square_of(found[0])
+            place = hips_square(found[0])
             if any(one_person((place, found), other) for other in seen.values()):
                 continue
             looks = looks_of(image, found)
@@ -208,8 +189,6 @@ class People:
             )
             person = self.people[name]
             if alone and name in looks and person.looks is not None:
-                usual = person.side or square[2]
-                person.side = (1 - RENEWED) * usual + RENEWED * square[2]
                 mean = (1 - RENEWED) * person.looks**2 + RENEWED * looks[name] ** 2
                 person.looks = np.sqrt(mean)
 

@@ -68,8 +68,8 @@ class Lookout:
 
     def add(self, place, image) -> None:
         found = self.look.people(image)
-        if not found:
-            found = self.look.small(image)
+        if not found or place % 2 == 0:
+            found = self.look.with_small(image, found)
         if place % 2 == 0:
             found += self.look.faceless(image, found)
         self.rows += [(place, *one) for one in found]

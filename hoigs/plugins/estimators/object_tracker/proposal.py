@@ -16,6 +16,7 @@ from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompt
 from hoigs.plugins.estimators.object_tracker.scene import Scene, carried
 
 SAMPLES = 24  # frames that are searched
+SHOWN, OTHERWISE = 0.3, 0.5  # visibility of a landmark; share of the frames that show everybody
 AREA = (0.0003, 0.12)  # of the image, least and largest
 PARTS = 6  # of a frame that are looked at
 OFTEN = 0.1  # mean over frames of likeness times score from which something is there again
@@ -65,7 +66,8 @@ def proposed(
     Args:
         people: landmarks of each in the footage. taken: pixels of other objects.
     """
-    frames = np.unique(np.linspace(0, len(footage) - 1, SAMPLES).astype(int)).tolist()
+    frames = _with_everybody(len(footage), people)
+    frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, SAMPLES).astype(int))]
     likeness = Likeness.of(footage, scene, people, frames)
     found: list[Candidate] = []
     for i in frames:
@@ -81,6 +83,15 @@ def proposed(
     known = _colors_of(footage, found, order[0], frames)
     grown = [_grown(likeness, c, known) for c in tried]
     return _spread(footage, grown)
+
+
+def _with_everybody(count: int, people: Sequence[Float[np.ndarray, "F 33 4"]]) -> list[int]:
+    """The frames in which nobody is lost, who would be taken for a thing there; all, if half of
+    them or fewer are such."""
+    shown = np.ones(count, bool)
+    for person in people:
+        shown &= (np.nan_to_num(person[..., 3]) > SHOWN).any(1)
+    return np.flatnonzero(shown if shown.mean() > OTHERWISE else np.ones(count, bool)).tolist()
 
 
 def _parts(
