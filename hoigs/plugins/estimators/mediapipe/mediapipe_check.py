@@ -43,9 +43,9 @@ class Check:
         return same
 
     def seen(self, image, points, space, square=None):
-        """How far landmarks are off in the mirror, as `apart` has it, and those in space without
-        what the network makes different of left and right: the mean of those in the picture and in
-        the mirrored one, if both show the same pose.
+        """How far landmarks are off in the mirror, as `apart` has it, and those in the image and in
+        space without what the network makes different of left and right: the mean of those in the
+        picture and in the mirrored one, if both show the same pose.
 
         Args:
             points: x, y in pixels, depth and visibility of the 33 landmarks; space: in metres.
@@ -55,10 +55,11 @@ class Check:
         back = mirrored(self.graph, self.rect, image, points, square)
         off = float("inf") if back is None else apart(points, back[0])
         if back is None or off > UNLIKE:
-            return off, space
-        mean = space.copy()
-        mean[:, :3] = (space[:, :3] + back[1][:, :3]) / 2
-        return off, mean
+            return off, points, space
+        means = points.copy(), space.copy()
+        for mean, other in zip(means, back, strict=True):
+            mean[:, :3] = (mean[:, :3] + other[:, :3]) / 2
+        return off, *means
 
     def lose(self) -> None:
         """Nobody is followed: whoever is found next is checked at once."""

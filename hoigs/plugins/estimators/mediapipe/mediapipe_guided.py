@@ -143,9 +143,9 @@ class GuidedPose:
         return min(near)[2] if near else None
 
     def mirrored(self, image, found):
-        """How far the pose in the mirror is off; what `look` found, with even places in space."""
+        """How far the pose in the mirror is off; what `look` found, with even places."""
         score, points, space, mask, square, why = found
-        off, space = self.check.seen(image, points, space, square)
+        off, points, space = self.check.seen(image, points, space, square)
         return off, (score, points, space, mask, square, why)
 
     def against(self, image, found, least):

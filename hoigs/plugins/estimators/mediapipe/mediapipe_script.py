@@ -205,8 +205,8 @@ class Finder:
             self.fate[self.names.index(name), i] = FOUND if name in seen else GONE
         for name, (image_xyzv, world_xyzv, _) in seen.items():
             k = self.names.index(name)
-            self.rows["image_xyzv"][k, i] = image_xyzv
-            _, self.rows["world_xyzv"][k, i] = self.check.seen(image, image_xyzv, world_xyzv)
+            _, *both = self.check.seen(image, image_xyzv, world_xyzv)
+            self.rows["image_xyzv"][k, i], self.rows["world_xyzv"][k, i] = both
         if wide is None:
             return
         owns = {name: own for name, (_, _, own) in seen.items()}
@@ -277,7 +277,7 @@ class Finder:
             own = found.segmentation_mask[above:] if self.masks else None
             doubted, how = doubt(points, own, wide), BORDER if above else FOUND
             if not doubted:
-                off, space = self.check.seen(image, points, space)
+                off, points, space = self.check.seen(image, points, space)
                 doubted = 0 if self.check.believes(off) else UNLIKE
             if doubted:
                 pose.reset()
