@@ -201,6 +201,11 @@ def test_two_objects_are_followed(alone: Path, environment: None, tmp_path: Path
     assert {"box seen", "box's poses", "mask of box"} <= {row[0] for row in report.rows()}
 
 
+def rolled(i: int, shift: int) -> np.ndarray:
+    """The tiny person's mask at another place; elsewhere it sways."""
+    return np.roll(np.logical_or(*masks(i)), shift + (2 * (i % 3) if shift else 0), 1)
+
+
 class Two(Estimator):
     """The tiny person, and the same again to the right."""
 
@@ -220,9 +225,7 @@ class Two(Estimator):
             known = landmarks()
             known["image_xyzv"][..., 0] += shift
             tracks[name] = Landmarks(known["image_xyzv"], known["world_xyzv"])
-            stacks[name] = LazyFrames(
-                video.frames, lambda i, s=shift: np.roll(np.logical_or(*masks(i)), s, 1)
-            )
+            stacks[name] = LazyFrames(video.frames, lambda i, s=shift: rolled(i, s))
         return Estimates(EntityMasks(stacks), tracks)
 
 
@@ -256,6 +259,13 @@ def test_several_people_are_fitted(alone: Path, tmp_path: Path, person) -> None:
     if person in ((), "all"):
         assert notes and notes[0].startswith("2 people are seen in frame 3, at 48,34, 78,34: ")
         assert notes[0] in report.warnings
+    if person == ():  # whoever is not fitted is no scene, either
+        always = np.all([rolled(i, 30) for i in range(FRAMES)], axis=0)
+        shown = rolled(4, 30) & ~clip[4].masks["human"].numpy()
+        ignored = clip[4].ignored.numpy()
+        assert (shown & ~always).any() and ignored[shown & ~always].all()
+        assert always.any() and not ignored[always].any()  # nothing else is seen there
+        assert not any("black patches" in text for text in report.warnings)
     if names[1:]:
         first, second = (clip[4].masks[n].numpy() > 0 for n in names)
         assert first.any() and second.any() and not (first & second).any()

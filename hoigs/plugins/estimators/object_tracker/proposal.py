@@ -66,7 +66,7 @@ def proposed(
     Args:
         people: landmarks of each in the footage. taken: pixels of other objects.
     """
-    frames = _with_everybody(len(footage), people)
+    frames = with_everybody(len(footage), people)
     frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, SAMPLES).astype(int))]
     likeness = Likeness.of(footage, scene, people, frames)
     found: list[Candidate] = []
@@ -85,7 +85,7 @@ def proposed(
     return _spread(footage, grown)
 
 
-def _with_everybody(count: int, people: Sequence[Float[np.ndarray, "F 33 4"]]) -> list[int]:
+def with_everybody(count: int, people: Sequence[Float[np.ndarray, "F 33 4"]]) -> list[int]:
     """The frames in which nobody is lost, who would be taken for a thing there; all, if half of
     them or fewer are such."""
     shown = np.ones(count, bool)
