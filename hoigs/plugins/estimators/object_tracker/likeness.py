@@ -19,7 +19,7 @@ from hoigs.plugins.estimators.object_tracker.footage import (
 )
 from hoigs.plugins.estimators.object_tracker.scene import Scene
 
-WRISTS = (15, 16)  # among MediaPipe's landmarks
+WRISTS, FEET = (15, 16), (27, 28, 31, 32)  # among MediaPipe's landmarks
 REACH = 0.8  # torsos around the hands in which colours of things are learnt
 CHANGED = 6.0  # units of noise by which a pixel differs from the scene
 
@@ -57,13 +57,14 @@ class Likeness:
         around: list[np.ndarray] = []
         scenery: list[np.ndarray] = []
         for i in frames if lengths else ():
-            if not first._hands(i):
+            if not first._seen(i, WRISTS):
                 continue
             bins = bins_of(footage.colors(i))
             bare = bare_limbs(footage.shape, [p[i] for p in people], torso) & footage.person[i]
             shown = footage.person[i] | (first._standing_out(i) > 0)
-            near = (first._gap(i) < REACH * torso) & shown
-            far = (first._gap(i) > 2 * REACH * torso) & ~footage.person[i]
+            gap = first._gap(i, WRISTS)
+            near = (gap < REACH * torso) & shown
+            far = (gap > 2 * REACH * torso) & ~footage.person[i]
             for found, region in ((body, bare), (around, near), (scenery, far)):
                 found += [histogram(bins, region * 1.0)] if region.any() else []
         if not body or not around:
@@ -92,22 +93,23 @@ class Likeness:
         within = np.where(held, 1.0, -0.7)
         return np.where(person, within, odds)
 
-    def _hands(self, i: int) -> list[Float[np.ndarray, "2"]]:
-        """x, y of everybody's wrists that are seen."""
-        return [p[i, k, :2] for p in self.people for k in WRISTS if p[i, k, 3] > 0.3]
+    def _seen(self, i: int, marks: Sequence[int]) -> list[Float[np.ndarray, "2"]]:
+        """x, y of everybody's landmarks that are seen."""
+        return [p[i, k, :2] for p in self.people for k in marks if p[i, k, 3] > 0.3]
 
-    def _gap(self, i: int) -> Float[np.ndarray, "h w"]:
-        """Pixels to the nearest hand, or to the person where no hand is seen."""
+    def _gap(self, i: int, marks: Sequence[int]) -> Float[np.ndarray, "h w"]:
+        """Pixels to the nearest of some landmarks, or to the person where no hand is seen."""
         height, width = self.footage.shape
         y, x = np.mgrid[:height, :width] + 0.5
-        if hands := self._hands(i):
-            return np.min([np.hypot(x - at[0], y - at[1]) for at in hands], axis=0)
+        if self._seen(i, WRISTS):
+            places = self._seen(i, marks)
+            return np.min([np.hypot(x - at[0], y - at[1]) for at in places], axis=0)
         person = self.footage.person[i]
         return (
             ndimage.distance_transform_edt(~person) if person.any() else np.zeros((height, width))
         )
 
     def nearness(self, i: int) -> Float[np.ndarray, "h w"]:
-        """From 1 at the hands, falling with distance: a half at the length of a torso."""
+        """From 1 at the hands and feet, falling with distance: a half at the length of a torso."""
         near = self.torso if np.isfinite(self.torso) else 0.12 * self.footage.diagonal
-        return 1 / (1 + (self._gap(i) / near) ** 4)
+        return 1 / (1 + (self._gap(i, (*WRISTS, *FEET)) / near) ** 4)
