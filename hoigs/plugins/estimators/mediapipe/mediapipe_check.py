@@ -17,6 +17,7 @@ SWAPPED += [mark + side for mark in range(11, 33, 2) for side in (1, 0)]
 BODY = [0, *range(11, 17), *range(23, 29)]  # nose, shoulders to wrists, hips to ankles
 UNLIKE = 0.15  # of the largest of torso, shoulders and thighs: mean distance of the two poses
 THIGHS = ((23, 25), (24, 26))
+LEGS = 1.5, 1.9  # least lengths of legs, in lengths of the torso and breadths of the shoulders
 AROUND = 2.5  # side of a square about the hips, in distances of the farthest landmark
 EVERY = 8  # frames of somebody who is followed, of which one is checked
 
@@ -101,7 +102,10 @@ def apart(points, other) -> float:
 
 
 def hips_square(points):
-    """The square about the middle of the hips that has all landmarks, guessed ones too."""
-    x, y = points[HIPS, :2].mean(0)
-    reach = np.linalg.norm(points[:, :2] - (x, y), axis=1).max()
-    return float(x), float(y), float(max(8.0, AROUND * reach))
+    """The square about the middle of the hips that has all landmarks, guessed ones too, and those
+    of legs as long as such a trunk has, which are guessed too short behind a table."""
+    shoulders, hips = points[SHOULDERS, :2], points[HIPS, :2].mean(0)
+    reach = np.linalg.norm(points[:, :2] - hips, axis=1).max()
+    trunk = np.linalg.norm(shoulders.mean(0) - hips), np.linalg.norm(shoulders[0] - shoulders[1])
+    reach = max(reach, LEGS[0] * trunk[0], LEGS[1] * trunk[1])
+    return float(hips[0]), float(hips[1]), float(max(8.0, AROUND * reach))
