@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float
 
 from hoigs.core.errors import HoigsError
+from hoigs.core.interfaces.estimator import PromptError
 from hoigs.core.reporting import Progress, ranges
 from hoigs.preparation.body.mask_fit import silhouette
 from hoigs.preparation.cameras.calibration import calibration_file
@@ -186,7 +187,15 @@ def estimates(
         chosen = _choose_people(draft, options, estimators)
         try:
             reader = _reader(chosen, options, estimators)
-            found = reader.landmarks_and_masks(progress)
+            try:
+                found = reader.landmarks_and_masks(progress)
+            except PromptError as error:
+                if not chosen.beside:
+                    raise
+                said = f"people beside the one who is fitted are not followed: {error}"
+                chosen = chosen.noting([said], beside={})
+                reader = _reader(chosen, options, estimators)
+                found = reader.landmarks_and_masks(progress)
         except NobodyFoundError as error:
             if not _object_shown(draft, options):
                 draft.work.worth_keeping = False

@@ -22,6 +22,7 @@ from hoigs.core.interfaces.estimator import (
     FramePrompt,
     Landmarks,
     LazyFrames,
+    PromptError,
 )
 from hoigs.core.system.environments import MARKER, EnvironmentAbsentError
 from hoigs.plugins.bodies.anny import AnnyBody
@@ -271,6 +272,26 @@ def test_several_people_are_fitted(alone: Path, tmp_path: Path, person) -> None:
         assert first.any() and second.any() and not (first & second).any()
         apart = (clip.bodies[names[1]].poses.transl - clip.bodies[names[0]].poses.transl)[:, 0]
         assert apart.mean() == pytest.approx(30 / (0.8 * WIDTH) * 2.8, rel=0.15)
+
+
+def test_people_beside_who_cannot_be_followed_are_left_out(alone: Path, tmp_path: Path) -> None:
+    class Lonely(Two):
+        def estimate(self, video, progress=None) -> Estimates:
+            if len(video.named("human")) > 1:
+                raise PromptError("no person is found there: 3 of human2")
+            return super().estimate(video, progress)
+
+    one = Lonely()
+    report = prepare(
+        alone, tmp_path / "clip", object="none", options=OPTIONS, body=AnnyBody(),
+        estimators={"landmarks": one, "masks": one},
+    )  # fmt: skip
+    assert any("are not followed: no person is found there" in text for text in report.warnings)
+    with pytest.raises(PromptError):
+        prepare(
+            alone, tmp_path / "both", object="none", person="all", options=OPTIONS,
+            body=AnnyBody(), estimators={"landmarks": one, "masks": one},
+        )  # fmt: skip
 
 
 def test_a_clip_of_an_object_alone(alone: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.environments import ManagedEnvironment
@@ -266,6 +267,10 @@ class Estimates:
     depth: DepthMaps | None = None
 
 
+class PromptError(HoigsError):
+    """Nothing, nobody, or somebody else is where a prompt says."""
+
+
 class Estimator(Configurable, ABC):
     """An estimator, or a reader of an estimator's files: a video in, estimates out.
 
@@ -311,6 +316,7 @@ class Estimator(Configurable, ABC):
         Long work leaves its results in `video.work`, so that it need not be done twice.
 
         Raises:
+            PromptError: a prompt shows nothing that can be followed.
             HoigsError: naming every file that is absent or does not fit and who makes it, or the
                 tool that failed and its last output.
         """

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hoigs.core.errors import HoigsError
-from hoigs.core.interfaces.estimator import EntityRequest, VideoRequest
+from hoigs.core.interfaces.estimator import EntityRequest, PromptError, VideoRequest
 from hoigs.plugins.estimators.mediapipe.estimator import LOOKS, MediapipeEstimator
 
 FRAMES, WIDTH, HEIGHT = 80, 320, 240
@@ -41,7 +40,7 @@ class Followed(MediapipeEstimator):
         if chosen is None:
             points[..., 1] = 77  # the detector's
         elif self.astray < 0:
-            raise HoigsError("no person is found there: 0 of human")
+            raise PromptError("no person is found there: 0 of human")
         fate = np.zeros((1, FRAMES), np.uint8)
         np.savez(out, image_xyzv=points, world_xyzv=points, fate=fate)
 

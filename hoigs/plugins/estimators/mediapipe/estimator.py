@@ -31,6 +31,7 @@ from hoigs.core.interfaces.estimator import (
     FramePrompt,
     Landmarks,
     LazyFrames,
+    PromptError,
     VideoRequest,
 )
 from hoigs.core.reporting import Progress, no_progress, ranges
@@ -255,8 +256,8 @@ class MediapipeEstimator(Estimator):
         order, chosen = _order(given, replace(video, entities=(human,)))
         try:
             out, found = self._found(order, chosen, video, given, progress)
-        except HoigsError:
-            return None  # nobody is found again there: said of the other way, if it fails as well
+        except PromptError:
+            return None  # nobody is found again in the square
         image = self._spread(found["image_xyzv"][0], given, video)
         if np.isfinite(image[given, 0, 0]).mean() < FOLLOWED:
             return None
@@ -312,7 +313,7 @@ class MediapipeEstimator(Estimator):
         except HoigsError as error:
             said = log.read_text(errors="replace") if log.is_file() else ""
             if chosen and (why := _misplaced(said)):
-                raise HoigsError(why) from error
+                raise PromptError(why) from error
             lacking = "has no mediapipe" in said
             raise HoigsError(f"{error}\n{INSTALL}" if lacking else str(error)) from error
         half.replace(out)
