@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from estimator_cases import FRAMES, HEIGHT, WIDTH, mask, request
 from pydantic import ValidationError
-from tiny_mediapipe import FAKE_CV2, FAKE_MODEL
+from tiny_mediapipe import FAKE_CV2, FAKE_LOOK, FAKE_MODEL
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
@@ -214,6 +214,7 @@ def fake_python(tmp_path) -> Path:
     (package / "__init__.py").write_text(FAKE)
     (package.parent / "cv2.py").write_text(FAKE_CV2)
     (package.parent / "mediapipe_check.py").write_text(FAKE_MODEL["mediapipe_check"])
+    (package.parent / "mediapipe_look.py").write_text(FAKE_LOOK.replace("PEOPLE", "[]"))
     for name, text in FAKE_GRAPH.items():
         (package.parent / name).parent.mkdir(parents=True, exist_ok=True)
         (package.parent / name).write_text(text)
