@@ -22,6 +22,7 @@ from hoigs.preparation.video.source import SourceError
 LENS = "SIMPLE_RADIAL"  # one focal length, one distortion: a video determines no more
 FEATURES = 8192  # of an image
 OVERLAP = 10  # frames that each is matched with, and as many at distances 1, 2, 4, 8, …
+WIDEST = 0.33  # focal length, in longer sides: a view of 113 degrees
 FURTHER = (1.15, 1.6, 0.55)  # focal lengths, in longer sides, after ASSUMED_FOCAL
 SMALLEST_SHARE = 0.5  # of the frames: with fewer cameras there is no clip
 
@@ -216,6 +217,7 @@ def _mapping(pycolmap: Any, calibrated: bool) -> Any:
     # a video adds its frames in order: the whole need not be solved anew after every tenth
     options.ba_refine_focal_length = options.ba_refine_extra_params = not calibrated
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+    options.min_focal_length_ratio = WIDEST  # such a view is a wrong turn: another start is tried
     return options
 
 
