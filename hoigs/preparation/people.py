@@ -380,15 +380,12 @@ def chosen_people(
         at, share = found[0], _tall(found[0]) / height
         if share > SMALL:
             return {}, {}, ""
-        return (
-            {options.human_name: at},
-            {},
-            (
-                f"the person seen in frame {at.frame}, at {_middle(at)}, is small (about "
-                f"{100 * share:.0f} % of the picture's height) and followed from there (--person "
-                "X,Y@FRAME chooses another); limbs of people so small are known less well"
-            ),
+        said = (
+            f"the person seen in frame {at.frame}, at {_middle(at)}, is small (about "
+            f"{100 * share:.0f} % of the picture's height) and followed from there (--person "
+            "X,Y@FRAME chooses another); limbs of people so small are known less well"
         )
+        return {options.human_name: at}, {}, said
     names = [options.human_name, *(f"{options.human_name}{k + 2}" for k in range(len(found) - 1))]
     boxes = dict(zip(names, found, strict=True))
     places = ", ".join(_middle(at) for at in found)

@@ -211,7 +211,7 @@ class EstimateReader:
         assert found is not None  # `checked` saw to it
         stacks = {name: self._stack(self._given(found, name)) for name in further}
         beside = [self._stack(self._given(found, name)) for name in self.beside]
-        masks = replace(masks, others=_all_of([*stacks.values()]), beside=_all_of(beside))
+        masks = replace(masks, others=_all_of(list(stacks.values())), beside=_all_of(beside))
         return FrameEstimates(landmarks, masks, stacks)
 
     def _given(self, found: EntityMasks, name: str) -> FrameArrays:

@@ -155,10 +155,11 @@ class MediapipeEstimator(Estimator):
     """Landmarks and mask of a person, or of all who are clicked on, by MediaPipe in one pass.
 
     It follows a person from frame to frame and loses one that jumps, so it is given every frame
-    from the first wanted one to the last. Where no landmarks are found it looks again with a
-    border above the frame, and landmarks that are not on the pose's own mask are dropped, with the
-    reason. That mask is the person's; along its outline the segmentations of the frame and of
-    the person's part of it have a say.
+    from the first wanted one to the last: by the square about those who are clicked on, or whom
+    most of a few looks show; else by MediaPipe's detector. Where that finds no landmarks it looks
+    again with a border above the frame, and landmarks that are not on the pose's own mask are
+    dropped, with the reason. That mask is the person's; along its outline the segmentations of the
+    frame and of the person's part of it have a say.
     """
 
     Config: ClassVar = MediapipeConfig
@@ -191,13 +192,12 @@ class MediapipeEstimator(Estimator):
         people = video.named("human") or ("human",)
         given = range(min(video.numbers, default=0), max(video.numbers, default=-1) + 1)
         order, chosen = _order(given, video)
-        clicked, looked = chosen is not None, None
-        if not clicked:
-            looked = self._by_looks(video, given, progress)
+        clicked = chosen is not None
+        looked = None if clicked else self._by_looks(video, given, progress)
         out, found = looked or self._found(order, chosen, video, given, progress)
         progress(1.0, "landmarks")
         text = f"MediaPipe Pose, complexity {self._complexity()}"
-        text += ", of the person clicked on" if clicked else ""
+        text += ", of whoever was chosen" if clicked else ""
         landmarks = {}
         for k, name in enumerate(people):
             image = self._spread(found["image_xyzv"][k], given, video)
@@ -217,7 +217,7 @@ class MediapipeEstimator(Estimator):
         }
         text = "MediaPipe's segmentation of poses, its outline refined by that of selfies"
         text += "; the same wherever frames of the still camera are" if still else ""
-        text += "; of the person clicked on" if clicked else ""
+        text += "; of whoever was chosen" if clicked else ""
         images = {name: track.image_xyzv for name, track in landmarks.items()}
         notes = _lost(given, images) if clicked else _others(found["several"], images[people[0]])
         if not clicked:
@@ -441,7 +441,7 @@ def _lost(given: range, images: Mapping[str, Float[np.ndarray, "F 33 4"]]) -> tu
     for name, image in images.items():
         seen = np.isfinite(image[given, 0, 0])
         if seen.mean() < FOLLOWED:
-            who = "the person clicked on" if len(images) == 1 else name
+            who = "the person chosen" if len(images) == 1 else name
             notes.append(
                 f"{who} was followed in {int(seen.sum())} of {len(given)} frames; click on them in "
                 f"another frame, too, such as {given[int(seen.argmin())]}"
