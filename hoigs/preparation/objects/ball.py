@@ -33,6 +33,7 @@ RASTER = 0.35  # pixels that a mask's outline is off by, for its pixels alone
 RIM = 2  # pixels: half the width of a limb that may hide it
 SMALLEST = 3.0  # pixels of the radius, median
 FEWEST, FEWEST_EDGES = 8, 12  # frames; edges of pixels along the outline
+SPILLS = 0.5  # of the ball's part that nothing hides, to lie outside its mask
 SHOWN, ENOUGH = 0.6, 0.35  # of the circle: to judge by it; to find the centre by it
 TOUCHES = 0.09  # metres in the image from a joint to the ball's outline, at the joint's distance
 ALONG = (0.25, 0.5, 0.75, 1.0)  # of a bone, where it is looked at
@@ -99,6 +100,9 @@ def ball_cones(masks: MaskStack, humans: MaskStack, cameras: Sequence[Camera]) -
             direction, angle, residual = fit_cone(rays[i])
             if free.mean() >= SHOWN:
                 off[i] = _off(residual, angle, focal)
+        spilled = _spilled(direction, angle, masks[i], humans[i], cameras[i])
+        if spilled > SPILLS:  # the side of something long is a part of a circle that is much larger
+            off[i] = spilled
         if off[i] <= 2 * MOSTLY and angle < 1:
             found[i] = *direction, angle
     known = np.isfinite(found[:, 3])
@@ -252,6 +256,25 @@ def _outline(
         points.append(np.stack((x - 0.5 + columns / 2, y - 0.5 + rows / 2), -1))
         free.append(~np.roll(hides, shift, (0, 1))[y, x])
     return np.concatenate(points), np.concatenate(free)
+
+
+def _spilled(
+    axis: Float[np.ndarray, " 3"],
+    angle: float,
+    mask: Bool[np.ndarray, "H W"],
+    human: Bool[np.ndarray, "H W"],
+    camera: Camera,
+) -> float:
+    """The share of a cone's pixels about the mask, and beside the person, that it does not have."""
+    ((top, bottom), (left, right)) = [
+        (max(0, int(at.min() - np.ptp(at))), int(at.max() + np.ptp(at)) + 1)
+        for at in np.nonzero(mask)
+    ]
+    y, x = np.nonzero(~human[top:bottom, left:right])
+    y, x = y + top, x + left
+    rays = outline_rays(np.stack((x + 0.5, y + 0.5), -1), camera)
+    inside = rays @ axis > np.cos(min(angle, np.pi))
+    return float((~mask[y[inside], x[inside]]).mean()) if inside.any() else 1.0
 
 
 def _off(residual: Float[np.ndarray, " N"], angle: float, focal: float) -> float:

@@ -78,6 +78,14 @@ def test_other_outlines_are_no_balls(shape: str) -> None:
         require_round(ball_cones(masks, NOBODY, CAMERAS), CAMERAS)
 
 
+def test_a_bow_is_no_part_of_a_large_ball() -> None:
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    away = np.hypot(x - 20, y - 60)
+    masks = MaskStack([(abs(away - 100) < 3) & (abs(y - 60) < 30)] * FRAMES)
+    with pytest.raises(NoBallError):
+        require_round(ball_cones(masks, NOBODY, CAMERAS), CAMERAS)
+
+
 def test_cones_ignore_rays_far_off() -> None:
     turns = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     ring = np.stack((0.05 * np.cos(turns) + 0.3, 0.05 * np.sin(turns), np.ones(60)), -1)

@@ -95,9 +95,7 @@ def doubts(tracks: dict[str, Track | None], footage: Footage) -> list[str]:
         if lost:
             notes.append(f"{name}: not seen in {_ranges(lost)}")
         if weak:
-            notes.append(
-                f"{name}: its mask is doubtful in {_ranges(weak)}; a click there corrects it"
-            )
+            notes.append(f"{name}: its mask is less sure in {_ranges(weak)}; a click there helps")
     return notes
 
 
