@@ -27,6 +27,7 @@ OVERLAP = 10  # frames that each is matched with, and as many at distances 1, 2,
 WIDEST = 0.33  # focal length, in longer sides: a view of 113 degrees
 FURTHER = (1.15, 1.6, 0.55)  # focal lengths, in longer sides, after ASSUMED_FOCAL
 SMALLEST_SHARE = 0.5  # of the frames: with fewer cameras there is no clip
+SHORTEST = 0.5  # seconds of a part of the video that is worth a clip
 
 
 def structure_from_motion(
@@ -197,7 +198,7 @@ def _mapped(pycolmap: Any, matches: Path, images: Path, folder: Path, lens: Lens
 
 
 def _what_to_do(model: Any, video: Frames) -> str:
-    """The frames that have a camera, and how to use the longest part of them."""
+    """The frames that have a camera, and how to use their longest part if it is of any use."""
     if model is None:
         return "To go on: "
     known = sorted(int(Path(image.name).stem) for image in model.images.values())
@@ -210,10 +211,12 @@ def _what_to_do(model: Any, video: Frames) -> str:
             runs.append([number])
     longest = max(runs, key=len)
     seconds = video.times[order[longest[-1]]] - video.times[order[longest[0]]]
-    return (
-        f"Frames {ranges(known)} of the video have one; --start {longest[0]}f --end "
-        f"{longest[-1] + 1}f uses the longest part of them, {seconds:.1f} s. To have more: "
+    part = (
+        f"; --start {longest[0]}f --end {longest[-1] + 1}f uses the longest part of them, "
+        f"{seconds:.1f} s"
     )
+    long = part if seconds >= SHORTEST else ""
+    return f"Frames {ranges(known)} of the video have one{long}. To have more: "
 
 
 def _not_installed() -> str:

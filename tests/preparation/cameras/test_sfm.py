@@ -204,11 +204,13 @@ def test_the_way_of_a_moving_camera(tmp_path: Path) -> None:
 
 
 def test_frames_with_a_camera_are_named_by_the_videos_numbers() -> None:
-    video = SimpleNamespace(indices=[4, 6, 8, 10, 12, 14], times=[0.4, 0.6, 0.8, 1.0, 1.2, 1.4])
+    video = SimpleNamespace(indices=[4, 6, 8, 10, 12, 14], times=[2, 3, 4, 5, 6, 7])
     images = [SimpleNamespace(name=f"{i:05d}.png") for i in (14, 4, 8, 10)]
     advice = _what_to_do(SimpleNamespace(images=dict(enumerate(images))), video)
     assert advice.startswith("Frames 4, 8, 10, 14 of the video have one")
-    assert "--start 8f --end 11f uses the longest part of them, 0.2 s" in advice
+    assert "--start 8f --end 11f uses the longest part of them, 1.0 s" in advice
+    video.times = [t / 30 for t in video.times]
+    assert "--start" not in _what_to_do(SimpleNamespace(images=dict(enumerate(images))), video)
 
 
 def test_frames_without_features_are_refused_with_advice(tmp_path: Path) -> None:
