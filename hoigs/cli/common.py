@@ -31,8 +31,7 @@ DeviceOption = Annotated[
     str, typer.Option("--device", "-d", help="cpu, cuda, or auto: cuda if available.")
 ]
 ClipOption = Annotated[
-    Path | None,
-    typer.Option("--clip", help="The clip, if it was moved: a folder or builtin:NAME."),
+    Path | None, typer.Option("--clip", help="The clip, if it was moved: a folder or builtin:NAME.")
 ]
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Replace what hoigs wrote to --out before.")

@@ -10,9 +10,7 @@ import typer
 from hoigs.cli.common import print_table
 
 
-def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-) -> None:
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Check the installation: versions, devices, rasterizers, video codecs, LPIPS weights."""
     from hoigs.studies.doctor import doctor as inspect
 

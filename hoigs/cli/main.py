@@ -25,11 +25,7 @@ from hoigs.cli import train as compress
 from hoigs.cli import train as evaluate
 from hoigs.cli import train as needs
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
-from hoigs.core.system.threads import (
-    keep_freed_memory,
-    share_processors,
-    short_waits_when_busy,
-)
+from hoigs.core.system.threads import keep_freed_memory, share_processors, short_waits_when_busy
 from hoigs.plugins.builtin import PARTS as BUILT_IN
 
 MAKE, TRAIN, SEE = "From a video to a clip", "From a clip to a run", "Look at it, take it away"

@@ -21,14 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hoigs.cli.common import (
-    DeviceOption,
-    Display,
-    PluginOption,
-    SetOption,
-    print_table,
-    with_json,
-)
+from hoigs.cli.common import DeviceOption, Display, PluginOption, SetOption, print_table, with_json
 from hoigs.core.errors import HoigsError
 from hoigs.core.system.files import printable
 from hoigs.runs.choices import pick_device
@@ -178,8 +171,7 @@ def one_line(text: str) -> str:
 
 def check_plugins(
     name: Annotated[
-        str,
-        typer.Argument(help="A key, kind:name, or a plugin, whose components are all checked."),
+        str, typer.Argument(help="A key, kind:name, or a plugin, whose components are all checked.")
     ],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with every result.")] = False,
     settings: SetOption = None,

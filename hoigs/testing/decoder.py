@@ -96,9 +96,7 @@ class DecoderSubject(ModuleSubject[Decoder]):
         color = random(3) * alpha[..., None] + (1 - alpha[..., None]) * 0.3
         output = RenderOutput(color, alpha, 3 * alpha * random(), channels)
         return Drawn(
-            output,
-            camera.to(device=self.device, dtype=dtype),
-            moment_at(time, dtype, self.device),
+            output, camera.to(device=self.device, dtype=dtype), moment_at(time, dtype, self.device)
         )
 
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[Drawn]:

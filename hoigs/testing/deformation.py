@@ -177,9 +177,7 @@ def require_same(what: str, got: Gaussians, expected: Gaussians, atol: float = 2
 
 
 def changed_by(
-    source: list[int],
-    fresh: Sequence[int] = (),
-    offsets: Tensor | None = None,
+    source: list[int], fresh: Sequence[int] = (), offsets: Tensor | None = None
 ) -> TopologyChange:
     """An index map; `fresh` are new rows."""
     marks = torch.zeros(len(source), dtype=torch.bool)

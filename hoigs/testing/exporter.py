@@ -41,10 +41,7 @@ class ExporterSubject(ComponentSubject[Exporter]):
         return ExportRequest(tiny_scene(), tiny_clip(), moments, entities, bodies)
 
     def export(
-        self,
-        out: Path,
-        request: ExportRequest | None = None,
-        progress: Progress = no_progress,
+        self, out: Path, request: ExportRequest | None = None, progress: Progress = no_progress
     ) -> Exported:
         return self.exporter().export(request or self.request(), out, progress)
 
@@ -113,11 +110,7 @@ def nothing_is_written_elsewhere(subject: ExporterSubject) -> None:
         subject.export(place / "scene")
         root = place.parent
         after = {n: d for n, d in contents(root).items() if not n.startswith("exports/scene")}
-        before = {
-            "exports": b"",
-            "exports/other.txt": b"another file",
-            "working-directory": b"",
-        }
+        before = {"exports": b"", "exports/other.txt": b"another file", "working-directory": b""}
         changed = sorted(n for n in before | after if before.get(n) != after.get(n))
         require(not changed, f"exporting changed {changed} beside the new folder")
 

@@ -95,11 +95,7 @@ def read_background(text: str, camera: Camera) -> Tensor:
 
 
 def source_frame(
-    clip: Clip,
-    frame: float,
-    camera: Camera,
-    channels: int,
-    shape: tuple[int, int] | None = None,
+    clip: Clip, frame: float, camera: Camera, channels: int, shape: tuple[int, int] | None = None
 ) -> UInt8[np.ndarray, "H W C"]:
     """The nearest frame of the video, as large as the picture beside it.
 

@@ -160,10 +160,7 @@ class SurfaceBody(SkinnedBody):
         if residual is not None and residual.means is not None:
             means = means + residual.means
         posed = replace(
-            canonical,
-            means=means,
-            quats=quats,
-            log_scales=canonical.log_scales + self.log_alpha,
+            canonical, means=means, quats=quats, log_scales=canonical.log_scales + self.log_alpha
         )
         if self.irradiance is None:
             return posed

@@ -79,8 +79,7 @@ def shared_among(gaussians: Gaussians, copies: Int[Tensor, " M"], min_opacity: f
     shrink = relocation_shrink(gaussians.opacities[rows], copies[rows])
     log_scales[rows] += shrink.log()[:, None]
     return gaussians.replace(
-        opacity_logits=torch.where(several, logits, gaussians.opacity_logits),
-        log_scales=log_scales,
+        opacity_logits=torch.where(several, logits, gaussians.opacity_logits), log_scales=log_scales
     )
 
 
@@ -146,11 +145,7 @@ class McmcDensity(DensityControl):
     cap: int
 
     def __init__(
-        self,
-        config: McmcDensityConfig | None = None,
-        *,
-        seed: int = 0,
-        clip: Clip | None = None,
+        self, config: McmcDensityConfig | None = None, *, seed: int = 0, clip: Clip | None = None
     ) -> None:
         self.config = config = config or McmcDensityConfig()
         self.window = Window(config.start, config.stop, config.interval)

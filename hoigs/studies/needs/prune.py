@@ -15,13 +15,7 @@ from torch import Tensor, nn
 from hoigs.core.interfaces.deformation import DeformationModel, HasKnots, has_knots
 from hoigs.core.interfaces.features import ReadsKnots
 from hoigs.core.maths.splines import uniform_times
-from hoigs.core.model.knot_refit import (
-    KnotTrial,
-    ScreenMotion,
-    as_movable,
-    remove_knots,
-    screen_of,
-)
+from hoigs.core.model.knot_refit import KnotTrial, ScreenMotion, as_movable, remove_knots, screen_of
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.parameters import on_host
 from hoigs.core.values.clip import Clip

@@ -271,12 +271,7 @@ class Search:
             spec = self._spec(overrides)  # raises: an invalid candidate is an error of its file
             try:
                 trials[candidate.name] = Trial(
-                    spec,
-                    self.view,
-                    space.region,
-                    names,
-                    self._registry(),
-                    self.device,
+                    spec, self.view, space.region, names, self._registry(), self.device
                 )
             except SpecError as error:
                 failed[candidate.name] = Step(candidate, problem=str(error))

@@ -305,10 +305,7 @@ def _train(
 
 
 def _verdict(
-    case: Case,
-    label: str,
-    has: frozenset[Capability],
-    progress: Sequence[_Progress],
+    case: Case, label: str, has: frozenset[Capability], progress: Sequence[_Progress]
 ) -> Verdict:
     lacks = [MEANING[c] for c in case.concerns if c not in has]
     if lacks:

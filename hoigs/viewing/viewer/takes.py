@@ -76,10 +76,7 @@ class Film:
     """
 
     def __init__(
-        self,
-        path: Path,
-        seconds: float,
-        draw: Callable[[float, View], UInt8[np.ndarray, "H W 3"]],
+        self, path: Path, seconds: float, draw: Callable[[float, View], UInt8[np.ndarray, "H W 3"]]
     ) -> None:
         self.drawn, self.count = 0, max(2, round(seconds * FILM_FPS))
         self._path, self._draw = Path(list(path.keys)), draw

@@ -32,10 +32,7 @@ class RigidFrames(DeformationModel):
     """
 
     kinds = frozenset({"object"})
-    rates: ClassVar[Mapping[str, str]] = {
-        "corrections.turns": "pose",
-        "corrections.shifts": "pose",
-    }
+    rates: ClassVar[Mapping[str, str]] = {"corrections.turns": "pose", "corrections.shifts": "pose"}
 
     def __init__(self, *, track: ObjectTrack, trained_frames: Sequence[int] | None = None) -> None:
         super().__init__()

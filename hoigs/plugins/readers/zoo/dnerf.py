@@ -30,8 +30,7 @@ class DnerfConfig(ReaderConfig):
     """Settings of reader:dnerf."""
 
     background: Literal["white", "black"] = Field(
-        default="black",
-        description="colour of transparent pixels and of renders",
+        default="black", description="colour of transparent pixels and of renders"
     )
     points: int = Field(
         default=2000, ge=1, description="random points to start from where no file has any (4DGS)"
