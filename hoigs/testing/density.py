@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,10 +15,7 @@ from hoigs.core.values.topology import TopologyChange
 from hoigs.testing.checks import CheckList, require, require_close, require_finite, require_zero
 from hoigs.testing.material import OBJECT, tiny_clip
 from hoigs.testing.modules import DeviceSubject, require_penalties, unchanged
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
+from hoigs.testing.runner import Options
 
 COUNT = 60
 TOTAL = 2000  # steps of the simulated run

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,10 +20,7 @@ from hoigs.core.reporting import Progress, no_progress
 from hoigs.testing.checks import CheckError, CheckList, ComponentSubject, require
 from hoigs.testing.material import HUMAN, OBJECT, TinyBody, moment_at, tiny_clip, tiny_scene
 from hoigs.testing.modules import unchanged
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
+from hoigs.testing.runner import Options
 
 TIMES = (0.0, 0.5, 1.0)
 

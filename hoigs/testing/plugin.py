@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -22,10 +22,7 @@ from hoigs.core.registry.manager import HOOK, Offer, Status, normal_name
 from hoigs.core.registry.registry import Registry
 from hoigs.core.system.environments import PYTHON
 from hoigs.testing.checks import CheckError, CheckList, require
-from hoigs.testing.runner import KINDS
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
+from hoigs.testing.runner import KINDS, Options
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,8 @@ class Candidate:
 
     def checks(self) -> list[Check[Any]]:
         """The P checks and those of its kind."""
-        return checks_of(self.key)
+        packages = [PLUGIN, *filter(None, [KINDS.get(kind_of(self.key))])]
+        return [check for name in packages for check in importlib.import_module(name).CHECKS]
 
     def result(self, check: Check[Any], expected: str | None = None) -> Result:
         """Run one of `checks`."""
@@ -107,12 +108,6 @@ class Candidate:
 
 def kind_of(key: str) -> str:
     return key.partition(":")[0]
-
-
-def checks_of(key: str) -> list[Check[Any]]:
-    """The checks for a key: those of all plugins, then those of its kind."""
-    packages = [PLUGIN, *([KINDS[kind_of(key)]] if kind_of(key) in KINDS else [])]
-    return [check for name in packages for check in importlib.import_module(name).CHECKS]
 
 
 def check(
