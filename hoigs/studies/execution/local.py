@@ -108,8 +108,7 @@ def make_executor(
         kind: Any = getattr(importlib.import_module(module), cls)
     except (ImportError, AttributeError) as error:
         raise HoigsError(f"--executor {name}: cannot be imported ({error})") from error
-    made: Executor = kind(slots=slots, threads=threads, address=address)
-    return made
+    return kind(slots=slots, threads=threads, address=address)
 
 
 def why_failed(log: Path, code: int) -> str:

@@ -253,8 +253,7 @@ def train_measured(session: Session, job: Job, runs_at_once: int = 1) -> None:
 def read_study(folder: Path) -> dict[str, Any]:
     """`study.json` of a run; without parts where there is none."""
     path = folder / STUDY
-    found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {"parts": []}
-    return found
+    return json.loads(path.read_text()) if path.is_file() else {"parts": []}
 
 
 def read_cost(folder: Path) -> Cost:
@@ -263,14 +262,10 @@ def read_cost(folder: Path) -> Cost:
     parts = study["parts"]
     if "train_s" not in study:
         return Cost(NotComputed(OLD), NotComputed(OLD), "", NotComputed(OLD), "", (), 1)
-    joules: Value
-    if len(parts) != 1 or "joules" not in parts[0]:
-        joules = NotComputed(INTERRUPTED)
-    else:
-        joules = from_json(parts[0]["joules"])
+    whole = len(parts) == 1 and "joules" in parts[0]
     return Cost(
         train_s=float(study["train_s"]),
-        joules=joules,
+        joules=from_json(parts[0]["joules"]) if whole else NotComputed(INTERRUPTED),
         source=parts[-1].get("source", "") if parts else "",
         memory_mb=_most(parts) if parts else NotComputed(NO_MEMORY),
         memory_source=parts[-1].get("memory_source", "") if parts else "",

@@ -117,8 +117,6 @@ def plan_chains(
     Args:
         capabilities: of each spec, by label.
     """
-    from hoigs.core.registry.registry import default_registry
-
     folders, registry = ClipFolders(), default_registry(list(study.plugins))
     own = {
         row.label: Spec.load(
