@@ -94,10 +94,6 @@ class Settings:
     overlays: set[str] = field(default_factory=set)
     see_through: bool = False
 
-    @staticmethod
-    def initial(modes: Sequence[str], entities: Sequence[str]) -> Settings:
-        return Settings(modes[0], set(entities))
-
     @property
     def look(self) -> Look:
         return Look(self.mode, frozenset(self.entities), self.interaction, self.background)
