@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -16,8 +17,6 @@ def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] 
 
     rows = inspect()
     if as_json:
-        import json
-
         typer.echo(json.dumps([row._asdict() | {"ok": row.ok} for row in rows], indent=1))
     else:
         print_table("hoigs doctor", ("what", "found", "note"), rows)

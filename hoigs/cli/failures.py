@@ -65,10 +65,8 @@ def refuse_empty(command: Any, words: Sequence[str]) -> None:
     for before, word in zip(["", *words], words):
         option, equals, value = word.partition("=")
         if word == "":
-            named = [(p.metavar or p.name).upper().strip("[]") for p in arguments] or [
-                "an argument"
-            ]
-            who = before if before.startswith("--") else " or ".join(named)
+            named = [(p.metavar or p.name).upper().strip("[]") for p in arguments]
+            who = before if before.startswith("--") else " or ".join(named or ["an argument"])
         elif option.startswith("--") and equals and not value:
             who = option
         else:
