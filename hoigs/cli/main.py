@@ -83,7 +83,6 @@ def _options(
         False, "--verbose", "-v", help="Print every step of the work, and tracebacks of failures."
     ),
 ) -> None:
-    del version
     common.Talk.quiet, common.Talk.verbose = quiet, verbose
 
 

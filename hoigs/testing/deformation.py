@@ -139,7 +139,6 @@ class DeformationSubject(ModuleSubject[DeformationModel]):
         return made.deformation
 
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[float]:
-        del dtype
         return (0.4, 0.0, 0.77, 1.3)
 
     def outputs(self, made: Entity, case: float) -> dict[str, Tensor]:

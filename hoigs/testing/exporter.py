@@ -66,7 +66,6 @@ CHECKS: CheckList[ExporterSubject] = CheckList("X")
 
 
 def subject(cls: type[Exporter], config: Any, options: Options) -> ExporterSubject:
-    del options
     made = ExporterSubject(cls, config)
     made.exporter()
     return made
@@ -155,7 +154,6 @@ def _stopped_export(subject: ExporterSubject, out: Path, stop: int) -> None:
 
     def progress(done: float, text: str) -> None:
         nonlocal count
-        del done, text
         if count == stop:
             raise _StoppedError
         count += 1

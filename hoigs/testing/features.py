@@ -69,7 +69,6 @@ class FeaturesSubject(ModuleSubject[FeatureExtractor]):
         return made.features
 
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[float]:
-        del dtype
         return (0.4, 0.0, 0.77, 1.2)
 
     def outputs(self, made: Entity, case: float) -> dict[str, Tensor]:

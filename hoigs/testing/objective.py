@@ -59,7 +59,6 @@ CHECKS: CheckList[ObjectiveSubject] = CheckList("L")
 
 
 def subject(cls: type[Objective], config: Any, options: Options) -> ObjectiveSubject:
-    del options
     made = ObjectiveSubject(cls, config)
     made.objective()
     return made

@@ -43,8 +43,7 @@ def draw(
 
 def picture(color: Float[Tensor, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
     """Values clamped to [0, 1] and rounded to 8 bits."""
-    array: np.ndarray = (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    return array
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def cut_out(output: RenderOutput) -> UInt8[np.ndarray, "H W 4"]:

@@ -164,10 +164,7 @@ class SurfaceBody(SkinnedBody):
         )
         if self.irradiance is None:
             return posed
-        lit: Gaussians = self.irradiance(
-            posed, turned_normals(self.normals, canonical.quats, quats)
-        )
-        return lit
+        return self.irradiance(posed, turned_normals(self.normals, canonical.quats, quats))
 
     def surface_points(self) -> Float[Tensor, "N 3"]:
         """Where each canonical point lies on the template in its zero pose, metres."""

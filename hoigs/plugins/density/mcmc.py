@@ -170,7 +170,6 @@ class McmcDensity(DensityControl):
         total_steps: int,
         extent: float,
     ) -> Refinement | None:
-        del current, statistics, extent
         if not self.window.refines(step, total_steps) or len(canonical) == 0:
             return None
         generator = step_generator(self.seed, step, canonical.means.device)
@@ -234,7 +233,6 @@ class McmcDensity(DensityControl):
         self, canonical: Gaussians, *, step: int, total_steps: int, rate: float
     ) -> Float[Tensor, "N 3"] | None:
         """Langevin noise (Eq. 8): Sigma eta, gated by opacity, until the end of the run."""
-        del total_steps
         size = rate * self.config.noise
         if size == 0 or len(canonical) == 0:
             return None

@@ -65,12 +65,8 @@ class Intrinsics(BaseModel):
     p2: FiniteFloat | None = None
 
 
-def _slashes(path: str) -> str:
-    return path.replace("\\", "/")
-
-
 # a path of the file, which Windows writes with backslashes
-DataPath = Annotated[str, AfterValidator(_slashes)]
+DataPath = Annotated[str, AfterValidator(lambda path: path.replace("\\", "/"))]
 
 
 class TransformFrame(Intrinsics):

@@ -152,7 +152,8 @@ class LocalExecutor:
             raise HoigsError(f"--address {address}: is for --executor ray; local has no cluster")
         self.slots = slots
         self._threads = threads or max(1, available_cpus() // slots)
-        self._memory = memory_gb if memory_gb is not None else _memory_gb()
+        installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+        self._memory = installed if memory_gb is None else memory_gb
         self._program = tuple(program)
         self._gpus = visible_gpus()
         self._next_gpu = 0
@@ -280,7 +281,3 @@ def visible_gpus() -> list[str]:
         return []
     listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
     return [str(i) for i in range(sum(x.startswith("GPU ") for x in listed.stdout.splitlines()))]
-
-
-def _memory_gb() -> float:
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9

@@ -53,11 +53,6 @@ class EnergyMeter:
         self._last = now
 
 
-def energy_meter(device: str) -> EnergyMeter | NotComputed:
-    """A meter of the GPU board for "cuda", else of the CPU packages."""
-    return nvml_meter(device) if device.startswith("cuda") else rapl_meter()
-
-
 def rapl_meter(root: Path = POWERCAP) -> EnergyMeter | NotComputed:
     """The counters of Linux for Intel and AMD CPUs, which only root can read on most systems."""
     if not root.is_dir():
@@ -238,7 +233,7 @@ def train_measured(session: Session, job: Job, runs_at_once: int = 1) -> None:
         parts.append(part)
         _write(path, record)
         start_peak(job.device)
-        meter = energy_meter(job.device)
+        meter = nvml_meter(job.device) if job.device.startswith("cuda") else rapl_meter()
         session.train(lambda _: meter.sample() if isinstance(meter, EnergyMeter) else None)
         joules = spent(meter)
         part["to_step"] = trainer.step

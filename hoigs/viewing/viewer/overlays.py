@@ -203,7 +203,6 @@ class Overlays:
         self._place("object points", "", frame)
 
     def _make_scene_points(self, frame: float) -> Any:
-        del frame
         yield self.scene.add_point_cloud(
             "/scene_points", self.clip.points.numpy(), _bytes(self.clip.point_colors),
             point_size=0.003 * self.size,
@@ -220,7 +219,6 @@ class Overlays:
         node.points, node.colors = self._depth_points(frame)
 
     def _make_cameras(self, frame: float) -> Any:
-        del frame
         yield from self._frusta("/cameras", images=False)
         centers = np.stack([c.center.numpy() for c in self.clip.cameras])
         if len(centers) > 1:
@@ -228,7 +226,6 @@ class Overlays:
             yield self.scene.add_line_segments("/cameras/path", segments, (255, 200, 80))
 
     def _make_camera_images(self, frame: float) -> Any:
-        del frame
         yield from self._frusta("/camera_images", images=True)
 
     def _frusta(self, place: str, images: bool) -> Any:

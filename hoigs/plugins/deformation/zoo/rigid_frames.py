@@ -41,7 +41,6 @@ class RigidFrames(DeformationModel):
 
     @classmethod
     def from_config(cls, config: ComponentConfig, context: BuildContext) -> Self:
-        del config
         if context.object_track is None:
             raise ValueError(
                 "deformation:rigid-frames needs a track; it suits entities of kind object"
