@@ -89,9 +89,8 @@ class DecoderSubject(ModuleSubject[Decoder]):
         channels = (2 * random(count) - 1) * alpha[..., None] if count else None
         color = random(3) * alpha[..., None] + (1 - alpha[..., None]) * 0.3
         output = RenderOutput(color, alpha, 3 * alpha * random(), channels)
-        return Drawn(
-            output, camera.to(device=self.device, dtype=dtype), moment_at(time, dtype, self.device)
-        )
+        camera = camera.to(device=self.device, dtype=dtype)
+        return Drawn(output, camera, moment_at(time, dtype, self.device))
 
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[Drawn]:
         return [self.drawn(time, dtype=dtype) for time in TIMES]
@@ -124,9 +123,8 @@ def it_gives_a_picture(subject: DecoderSubject) -> None:
         for case in (whole, whole.part(2, 3, 11, 5), whole.part(0, 0, 1, 1)):
             picture = subject.outputs(decoder, case)["picture"]
             expected = [case.camera.height, case.camera.width, 3]
-            require(
-                list(picture.shape) == expected, f"it is {list(picture.shape)}, expected {expected}"
-            )
+            got = list(picture.shape)
+            require(got == expected, f"it is {got}, expected {expected}")
             require_finite("the picture", picture.detach())
 
 

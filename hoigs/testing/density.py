@@ -204,9 +204,8 @@ def values_are_finite(subject: DensitySubject) -> None:
             decision = subject.refine(control, step, canonical, seen)
             if decision is not None and decision.canonical is not None:
                 for name in RAW:
-                    require_finite(
-                        f"{name} of the new canonical Gaussians", getattr(decision.canonical, name)
-                    )
+                    value = getattr(decision.canonical, name)
+                    require_finite(f"{name} of the new canonical Gaussians", value)
                 break
 
 
@@ -217,10 +216,8 @@ def no_gaussians_are_accepted(subject: DensitySubject) -> None:
     empty = subject.cloud(0)
     for step in range(0, TOTAL + 1, 50):
         decision = subject.refine(control, step, empty, DensityStatistics.zeros(0, subject.device))
-        grown = (
-            decision is not None and decision.canonical is not None and len(decision.canonical) > 0
-        )
-        require(not grown, "it adds Gaussians to an empty entity")
+        new = None if decision is None else decision.canonical
+        require(new is None or len(new) == 0, "it adds Gaussians to an empty entity")
         control.perturb(empty, step=step, total_steps=TOTAL, rate=1e-3)
 
 

@@ -94,9 +94,8 @@ def _probe(steps: Sequence[str], first: Sequence[str], hook: str | None) -> dict
     """What importing each of `steps` does, in one process that has imported `first`."""
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder) / "job.json", Path(folder) / "result.json"
-        job.write_text(
-            json.dumps({"path": sys.path, "first": first, "hook": hook, "steps": list(steps)})
-        )
+        task = {"path": sys.path, "first": first, "hook": hook, "steps": list(steps)}
+        job.write_text(json.dumps(task))
         command = [*PYTHON, str(PROBE), str(result), str(job)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if not result.is_file():

@@ -272,9 +272,8 @@ def reading_writes_nothing(subject: ReaderSubject) -> None:
             require(same, f"image {position}, read twice, differs")
         require(torch.equal(first.points, second.points), "points, read twice, differ")
         after = {path: path.read_bytes() for path in files_of(folder)}
-        changed = [
-            str(p.relative_to(folder)) for p in {*before, *after} if before.get(p) != after.get(p)
-        ]
+        other = [path for path in {*before, *after} if before.get(path) != after.get(path)]
+        changed = [str(path.relative_to(folder)) for path in other]
         require(not changed, f"reading changed {changed}")
 
 

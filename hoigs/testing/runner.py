@@ -78,9 +78,8 @@ class Candidate:
         """The subject of its kind's checks; the exception where it cannot be built."""
         package = importlib.import_module(KINDS[kind_of(self.key)])
         try:
-            config = self.registry.config_class(self.key).model_validate(
-                dict(self.options.settings)
-            )
+            settings = dict(self.options.settings)
+            config = self.registry.config_class(self.key).model_validate(settings)
             return package.subject(self.registry.get(self.key), config, self.options)
         except Exception as error:  # a plugin may raise anything
             return error

@@ -303,9 +303,8 @@ class Pruning:
     def planes(self) -> None:
         """Remove time planes that are one, or that may be replaced by one."""
         for key, names in self.trained.blocks().items():
-            planes = [
-                p for n in names for p in time_planes(self.trained.model.entity(n).deformation)
-            ]
+            models = [self.trained.model.entity(name).deformation for name in names]
+            planes = [plane for model in models for plane in time_planes(model)]
             deformation = self.trained.spec.model[key].deformation
             if not planes or "time_resolution" not in deformation.settings:
                 continue
@@ -426,9 +425,8 @@ class Pruning:
             why += f" ({unseen:,} of these are in no training image)" if unseen else ""
             if not len(rows):
                 why = "removing any of them is visible"
-            self._record(
-                Cut(f"Gaussians of {name}", "Gaussians", before, before - len(rows), cost, why)
-            )
+            what, after = f"Gaussians of {name}", before - len(rows)
+            self._record(Cut(what, "Gaussians", before, after, cost, why))
 
     def tune(self) -> None:
         """Train with the rest of the budget, less one scoring, at the last rates of the schedules.

@@ -180,10 +180,9 @@ class Search:
             if not untried:
                 return Answer(space, block, None, skipped=UNTRIED)
             return self._chosen(space, block, untried[0], blocks, skipped=UNTRIED)
-        if space.turn_unknown and not self.settings.smallest and self._turn_unknown(block):
-            return self._chosen(
-                space, block, space.turn_unknown, blocks, skipped=space.turn_unknown.why
-            )
+        unknown = space.turn_unknown
+        if unknown and not self.settings.smallest and self._turn_unknown(block):
+            return self._chosen(space, block, unknown, blocks, skipped=unknown.why)
         held, apart = len(self.held), CALIBRATION * budget if space.calibrated else 0.0
         budget -= apart
         try:

@@ -330,9 +330,8 @@ class Validator:
                 request=RenderRequest(subset=subset),
             )
             squares = (output.color.cpu().clamp(0, 1) - frame.rgb).square().mean(-1)
-            masks = region_masks(
-                frame, self.clip.kinds, default_band(frame.camera.width, frame.camera.height)
-            )
+            band = default_band(frame.camera.width, frame.camera.height)
+            masks = region_masks(frame, self.clip.kinds, band)
             for region in WATCHED:
                 if masks[region].any():
                     error = squares[masks[region]].mean()

@@ -342,9 +342,8 @@ def large_values_change_only_their_pixels(subject: RasterizerSubject) -> None:
     output, gradients = subject.drawn(corrupted(plain, enlarge), elsewhere)
     for name, image in images(wanted).items():
         got = images(output)[name].detach().cpu()[~covered]
-        require_close(
-            f"{name} elsewhere", got, image.detach().cpu()[~covered], atol=2e-6, rtol=1e-5
-        )
+        want = image.detach().cpu()[~covered]
+        require_close(f"{name} elsewhere", got, want, atol=2e-6, rtol=1e-5)
     others = ~alone
     for name in ROWS:
         actual, want = received(gradients, name), received(wanted_gradients, name)

@@ -284,9 +284,8 @@ class Viewer:
             names = frozenset(second.names) & look.entities
             return second.draw(there, camera, replace(look, entities=names)).image
 
-        return Picture(
-            joined(settings.layout, settings.share, size, camera_of, draw_first, draw_second)
-        )
+        layout, share = settings.layout, settings.share
+        return Picture(joined(layout, share, size, camera_of, draw_first, draw_second))
 
     def _own_frame(
         self, frame: float, canvas: tuple[int, int]

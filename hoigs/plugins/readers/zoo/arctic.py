@@ -109,9 +109,8 @@ class ArcticReader(ClipReader):
                 f"{lens.height}: the full images are needed, not cropped_images/"
             )
         cameras = [lens.camera(w2c) for w2c in poses]
-        kinds: dict[str, EntityKind] = (
-            {"human": "human", "object": "object"} if self.config.masks else {}
-        )
+        both: dict[str, EntityKind] = {"human": "human", "object": "object"}
+        kinds = both if self.config.masks else {}
         bodies = {"human": _body(place, subject, frames)} if self.config.masks else {}
         track, angles = _object(place, truth[frames])
         store = LazyFrames(

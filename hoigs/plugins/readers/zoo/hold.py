@@ -87,9 +87,8 @@ class HoldReader(ClipReader):
         values = {n: VALUES[n.removeprefix("hand_")] for n in kinds}
         masks = {n: MaskFiles(paths, partial(_marked, value)) for n, value in values.items()}
         track = _object(data["entities"].get("object"), len(images), where)
-        store = LazyFrames(
-            build, PixelFiles(images, masks=masks), cameras, cache_mb=self.config.cache_mb
-        )
+        pixels = PixelFiles(images, masks=masks)
+        store = LazyFrames(build, pixels, cameras, cache_mb=self.config.cache_mb)
         away = float(cameras[0].to_camera(track.translations)[:, 2].median())
         span = (NEAREST * away, FARTHEST * away)
         points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.config.points)
