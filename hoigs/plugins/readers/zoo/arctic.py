@@ -113,18 +113,10 @@ class ArcticReader(ClipReader):
         kinds = both if self.config.masks else {}
         bodies = {"human": _body(place, subject, frames)} if self.config.masks else {}
         track, angles = _object(place, truth[frames])
-        store = LazyFrames(
-            place.root,
-            PixelFiles(
-                images,
-                masks={n: MaskFiles(paths) for n, paths in masks.items()}
-                if self.config.masks
-                else None,
-            ),
-            cameras,
-            lenses=[lens] * len(frames),
-            cache_mb=self.config.cache_mb,
-        )
+        known = {n: MaskFiles(paths) for n, paths in masks.items()} if self.config.masks else None
+        pixels, lenses = PixelFiles(images, masks=known), [lens] * len(frames)
+        cache = self.config.cache_mb
+        store = LazyFrames(place.root, pixels, cameras, lenses=lenses, cache_mb=cache)
         away = float(cameras[0].to_camera(track.translations)[:, 2].median())
         span = (BEHIND[0] * away, BEHIND[1] * away)
         points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.config.points)

@@ -350,18 +350,13 @@ class BehaveReader(ClipReader):
             depths.append(depth if depth.is_file() else None)
             for name, names in _mask_names(place).items():
                 masks[name].append(_found(folder, *names) if self.config.masks else None)
-        cameras = [camera] * len(frames)
-        store = LazyFrames(
-            folder,
-            PixelFiles(
-                images,
-                masks={n: MaskFiles(p) for n, p in masks.items()} if self.config.masks else None,
-                depth=DepthFiles(depths, scale=0.001) if any(depths) else None,
-            ),
-            cameras,
-            lenses=[lens] * len(frames),
-            cache_mb=self.config.cache_mb,
+        cameras, lenses = [camera] * len(frames), [lens] * len(frames)
+        pixels = PixelFiles(
+            images,
+            masks={n: MaskFiles(p) for n, p in masks.items()} if self.config.masks else None,
+            depth=DepthFiles(depths, scale=0.001) if any(depths) else None,
         )
+        store = LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb)
         return _View(store, cameras)
 
     def _others(self, folder: Path, info: SequenceInfo, frames: Sequence[Path]) -> dict[int, _View]:

@@ -87,15 +87,10 @@ class DnerfReader(ClipReader):
         }
         times = [frame.time for _, _, frame in rows if frame.time is not None]
         points, colors, origin = self._points(folder)
+        pixels = PixelFiles(images, background=COLORS[self.config.background])
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                PixelFiles(images, background=COLORS[self.config.background]),
-                cameras,
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb),
             cameras=cameras,
             moments=timed_moments(times, split["train"]),
             points=points,

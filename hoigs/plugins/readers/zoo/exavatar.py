@@ -288,15 +288,11 @@ class ExavatarReader(ClipReader):
         }
         if not bodies:
             provenance["poses of human"] = NO_POSES
+        masks = MaskFiles([files.masks[n] for n in numbers])
+        pixels = PixelFiles(images, masks={"human": masks})
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                PixelFiles(images, masks={"human": MaskFiles([files.masks[n] for n in numbers])}),
-                cameras,
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb),
             cameras=cameras,
             moments=video_moments(indices, indices[-1] + 1, bodies),
             kinds={"human": "human"},
