@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hoigs.core.reporting import Progress
 from hoigs.core.system.files import printable
 
 if TYPE_CHECKING:
@@ -31,8 +31,7 @@ DeviceOption = Annotated[
     str, typer.Option("--device", "-d", help="cpu, cuda, or auto: cuda if available.")
 ]
 ClipOption = Annotated[
-    Path | None,
-    typer.Option("--clip", help="The clip, if it was moved: a folder or builtin:NAME."),
+    Path | None, typer.Option("--clip", help="The clip, if it was moved: a folder or builtin:NAME.")
 ]
 OverwriteOption = Annotated[
     bool, typer.Option("--overwrite", help="Replace what hoigs wrote to --out before.")
@@ -123,12 +122,8 @@ def print_table(
     for i, width in enumerate(_shared(widths, console.width - room)):
         values = [row[i] for row in cells[1:] if row[i]]
         numbers = i > 0 and all(value.lstrip("+-")[:1].isdigit() for value in values)
-        table.add_column(
-            escape(cells[0][i]),
-            justify="right" if numbers else "left",
-            overflow="fold",
-            width=width,
-        )
+        side: Any = "right" if numbers else "left"
+        table.add_column(escape(cells[0][i]), justify=side, overflow="fold", width=width)
     for row in cells[1:]:
         table.add_row(*map(escape, row))  # "hoigs[gsplat]" is no markup
     console.print(table if rows else f"[bold]{table.title}[/bold]", highlight=False)
@@ -158,46 +153,32 @@ def _shared(widths: Sequence[tuple[int, int]], space: int) -> list[int | None]:
     return [None] * len(widths)
 
 
-class Bar:
-    """One progress bar; `update(done, text)` from anywhere."""
-
-    def __init__(self, progress: Any, task: Any) -> None:
-        self._progress, self._task = progress, task
-
-    def update(self, done: float, text: str = "") -> None:
-        self._progress.update(self._task, completed=done, text=text)
-
-
 @contextmanager
-def progress_bar(title: str, total: float) -> Iterator[Bar]:
+def progress_bar(title: str, total: float) -> Iterator[Progress]:
     """A bar with elapsed time and ETA on stderr; quiet when stderr is not a terminal, or with -q.
 
-    In a notebook it is the notebook's own kind of output, which rich makes.
+    It is moved by a call with what is done and a text. In a notebook it is the notebook's own kind
+    of output, which rich makes.
     """
+    from rich import progress as bars
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
 
     console = Console(stderr=True)
     count = "{task.completed:.0f}/{task.total:.0f}" if total > 1 else "{task.percentage:.0f} %"
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn(count),
-        TimeElapsedColumn(),
-        TextColumn("ETA"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[text]}"),
+    with bars.Progress(
+        bars.TextColumn("{task.description}"),
+        bars.BarColumn(),
+        bars.TextColumn(count),
+        bars.TimeElapsedColumn(),
+        bars.TextColumn("ETA"),
+        bars.TimeRemainingColumn(),
+        bars.TextColumn("{task.fields[text]}"),
         console=console,
         transient=False,
         disable=Talk.quiet or not (console.is_terminal or console.is_jupyter),
     ) as progress:
-        yield Bar(progress, progress.add_task(title, total=total, text=""))
+        task = progress.add_task(title, total=total, text="")
+        yield lambda done, text: progress.update(task, completed=done, text=text)
 
 
 # Display of long commands: lines on stdout, and one progress bar at a time on stderr.
@@ -219,7 +200,7 @@ class Display:
 
     def __init__(self) -> None:
         self._bars = ExitStack()
-        self._bar: Bar | None = None
+        self._bar: Progress | None = None
         self._steps = 0
         self._began, self._last = time.perf_counter(), ""
         self._psnr: dict[str, float] = {}
@@ -227,12 +208,7 @@ class Display:
     def __enter__(self) -> Display:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end_bar()
 
     def line(self, text: str) -> None:
@@ -266,7 +242,7 @@ class Display:
         self._psnr.update(report.psnr)
         score = f" test {self._psnr['test']:.2f} dB" if "test" in self._psnr else ""
         gaussians = sum(report.counts.values())
-        self._bar.update(report.step, f"loss {report.loss:.4f}{score} {gaussians} Gaussians")
+        self._bar(report.step, f"loss {report.loss:.4f}{score} {gaussians} Gaussians")
         if report.psnr:
             rest = (self._steps - report.step) * report.time_s / report.step
             say(
@@ -282,7 +258,7 @@ class Display:
             say(f"{seconds:7.1f} s  {100 * done:3.0f} %  {printable(text)}")
         if self._bar is None:
             self._bar = self._bars.enter_context(progress_bar("working", 1.0))
-        self._bar.update(done, text)
+        self._bar(done, text)
 
     def _end_bar(self) -> None:
         self._bars.close()

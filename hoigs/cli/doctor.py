@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -10,16 +11,12 @@ import typer
 from hoigs.cli.common import print_table
 
 
-def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-) -> None:
+def doctor(as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> None:
     """Check the installation: versions, devices, rasterizers, video codecs, LPIPS weights."""
     from hoigs.studies.doctor import doctor as inspect
 
     rows = inspect()
     if as_json:
-        import json
-
         typer.echo(json.dumps([row._asdict() | {"ok": row.ok} for row in rows], indent=1))
     else:
         print_table("hoigs doctor", ("what", "found", "note"), rows)

@@ -65,10 +65,8 @@ def refuse_empty(command: Any, words: Sequence[str]) -> None:
     for before, word in zip(["", *words], words):
         option, equals, value = word.partition("=")
         if word == "":
-            named = [(p.metavar or p.name).upper().strip("[]") for p in arguments] or [
-                "an argument"
-            ]
-            who = before if before.startswith("--") else " or ".join(named)
+            named = [(p.metavar or p.name).upper().strip("[]") for p in arguments]
+            who = before if before.startswith("--") else " or ".join(named or ["an argument"])
         elif option.startswith("--") and equals and not value:
             who = option
         else:
@@ -125,18 +123,15 @@ def message_of(error: Exception) -> str | None:
     """The message of a failure that a user can mend; None of a mistake in hoigs."""
     if isinstance(error, HoigsError):
         return str(error)
-    if isinstance(error, MemoryError) or is_out_of_memory(error):
+    # torch has no class of its own for it on a CPU
+    allocated = isinstance(error, RuntimeError) and any(word in str(error) for word in ALLOCATORS)
+    if isinstance(error, MemoryError) or allocated:
         return f"{TOO_LARGE} ({_first_line(error)})"
     if type(error).__name__ == "DecompressionBombError":  # Pillow's, which is not imported here
         return f"an image is too large to be opened safely: {_first_line(error)}"
     if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):
         return _of_system(error)
     return None
-
-
-def is_out_of_memory(error: Exception) -> bool:
-    """Whether torch, which has no class of its own for it on a CPU, could not allocate."""
-    return isinstance(error, RuntimeError) and any(word in str(error) for word in ALLOCATORS)
 
 
 def _of_system(error: OSError) -> str:

@@ -7,29 +7,9 @@ from typing import Any
 import typer
 
 from hoigs import __version__
-from hoigs.cli import common, doctor, study, train
-from hoigs.cli import doctor as bug_report
-from hoigs.cli import make as annotate
-from hoigs.cli import make as demo
-from hoigs.cli import make as prepare
-from hoigs.cli import make as refine
-from hoigs.cli import parts as estimators
-from hoigs.cli import parts as plugins
-from hoigs.cli import parts as spec
-from hoigs.cli import see as export
-from hoigs.cli import see as publish
-from hoigs.cli import see as render
-from hoigs.cli import see as view
-from hoigs.cli import study as batch
-from hoigs.cli import train as compress
-from hoigs.cli import train as evaluate
-from hoigs.cli import train as needs
+from hoigs.cli import common, doctor, make, parts, see, study, train
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
-from hoigs.core.system.threads import (
-    keep_freed_memory,
-    share_processors,
-    short_waits_when_busy,
-)
+from hoigs.core.system.threads import keep_freed_memory, share_processors, short_waits_when_busy
 from hoigs.plugins.builtin import PARTS as BUILT_IN
 
 MAKE, TRAIN, SEE = "From a video to a clip", "From a clip to a run", "Look at it, take it away"
@@ -59,30 +39,30 @@ app = typer.Typer(
 study_app = typer.Typer(no_args_is_help=True, help="Compare methods, and find their limits.")
 study_app.command("compare")(study.compare)
 study_app.command("stress")(study.stress)
-study_app.command("needs")(needs.needs)
-app.command("demo", rich_help_panel=MAKE)(demo.demo)
-app.command("annotate", rich_help_panel=MAKE)(annotate.annotate)
-app.command("prepare", rich_help_panel=MAKE)(prepare.prepare)
-app.command("refine", rich_help_panel=MAKE)(refine.refine)
+study_app.command("needs")(train.needs)
+app.command("demo", rich_help_panel=MAKE)(make.demo)
+app.command("annotate", rich_help_panel=MAKE)(make.annotate)
+app.command("prepare", rich_help_panel=MAKE)(make.prepare)
+app.command("refine", rich_help_panel=MAKE)(make.refine)
 app.command("train", rich_help_panel=TRAIN)(train.train)
-app.command("eval", rich_help_panel=TRAIN)(evaluate.evaluate)
-app.command("render", rich_help_panel=SEE)(render.render)
-app.command("view", rich_help_panel=SEE)(view.view)
+app.command("eval", rich_help_panel=TRAIN)(train.evaluate)
+app.command("render", rich_help_panel=SEE)(see.render)
+app.command("view", rich_help_panel=SEE)(see.view)
 app.command(
     "export",
     rich_help_panel=SEE,
     epilog="Formats:\n\n" + "\n".join(f"- `{name}`: {summary}" for name, summary in FORMATS),
-)(export.export)
-app.command("publish", rich_help_panel=SEE)(publish.publish)
-app.command("batch", rich_help_panel=STUDY)(batch.batch)
-app.command("work", rich_help_panel=STUDY)(batch.work)
+)(see.export)
+app.command("publish", rich_help_panel=SEE)(see.publish)
+app.command("batch", rich_help_panel=STUDY)(study.batch)
+app.command("work", rich_help_panel=STUDY)(study.work)
 app.add_typer(study_app, name="study", rich_help_panel=STUDY)
-app.command("compress", rich_help_panel=TRAIN)(compress.compress)
-app.add_typer(plugins.plugins_app, name="plugins", rich_help_panel=PARTS)
-app.add_typer(spec.spec_app, name="spec", rich_help_panel=PARTS)
-app.add_typer(estimators.estimators_app, name="estimators", rich_help_panel=PARTS)
+app.command("compress", rich_help_panel=TRAIN)(train.compress)
+app.add_typer(parts.plugins_app, name="plugins", rich_help_panel=PARTS)
+app.add_typer(parts.spec_app, name="spec", rich_help_panel=PARTS)
+app.add_typer(parts.estimators_app, name="estimators", rich_help_panel=PARTS)
 app.command("doctor", rich_help_panel=HELP)(doctor.doctor)
-app.command("bug-report", rich_help_panel=HELP)(bug_report.bug_report)
+app.command("bug-report", rich_help_panel=HELP)(doctor.bug_report)
 
 
 def _version(show: bool) -> None:
@@ -103,7 +83,6 @@ def _options(
         False, "--verbose", "-v", help="Print every step of the work, and tracebacks of failures."
     ),
 ) -> None:
-    del version
     common.Talk.quiet, common.Talk.verbose = quiet, verbose
 
 

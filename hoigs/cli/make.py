@@ -33,9 +33,8 @@ def demo(*, options: DemoOptions) -> None:
             report=show.line,
         )  # fmt: skip
     print_summary(runs)
-    typer.echo(
-        f"demo took {time.perf_counter() - began:.0f} s; open {Path(options.out) / 'report.html'}"
-    )
+    page = Path(options.out) / "report.html"
+    typer.echo(f"demo took {time.perf_counter() - began:.0f} s; open {page}")
 
 
 # `hoigs prepare`: make a clip folder from a video.

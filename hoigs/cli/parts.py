@@ -20,16 +20,10 @@ from string import Template
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+import yaml
 
-from hoigs.cli.common import (
-    DeviceOption,
-    Display,
-    PluginOption,
-    SetOption,
-    print_table,
-    with_json,
-)
-from hoigs.core.errors import HoigsError
+from hoigs.cli.common import DeviceOption, Display, PluginOption, SetOption, print_table, with_json
+from hoigs.core.errors import HoigsError, PluginError, SpecError, did_you_mean
 from hoigs.core.system.files import printable
 from hoigs.runs.choices import pick_device
 
@@ -54,8 +48,6 @@ def show_plugin(
 
     pages = describe_all(name, default_registry(plugin or ()))
     if as_json:
-        import json
-
         typer.echo(json.dumps(pages, indent=1))
         return
     typer.echo("\n\n".join(as_text(page) for page in pages))
@@ -67,7 +59,6 @@ def describe_all(name: str, registry: Registry) -> list[dict[str, Any]]:
     Raises:
         PluginError: it means none; with the nearest name.
     """
-    from hoigs.core.errors import PluginError, did_you_mean
     from hoigs.core.registry.manager import normal_name
 
     manager = registry.manager
@@ -111,9 +102,8 @@ def _component(offer: Offer, registry: Registry) -> dict[str, Any]:
     if offer.status == "ok":
         from hoigs.core.registry.settings import describe_settings
 
-        page["settings"] = [
-            asdict(s) for s in describe_settings(registry.config_class(offer.exact))
-        ]
+        found = describe_settings(registry.config_class(offer.exact))
+        page["settings"] = [asdict(s) for s in found]
     return page
 
 
@@ -140,7 +130,6 @@ def _origin(plugin: Plugin) -> dict[str, Any]:
 
 def as_text(page: dict[str, Any]) -> str:
     """A page for reading; what does not apply is left out."""
-
     lines = []
     for name, value in page.items():
         if name == "settings" or value in (None, "", []):
@@ -178,8 +167,7 @@ def one_line(text: str) -> str:
 
 def check_plugins(
     name: Annotated[
-        str,
-        typer.Argument(help="A key, kind:name, or a plugin, whose components are all checked."),
+        str, typer.Argument(help="A key, kind:name, or a plugin, whose components are all checked.")
     ],
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with every result.")] = False,
     settings: SetOption = None,
@@ -201,7 +189,7 @@ def check_plugins(
         reports = check_plugin(
             name,
             expected_failures=dict(_pair(text, "--expect") for text in expect or ()),
-            settings={k: _value(v) for k, v in (_pair(t, "--set") for t in settings or ())},
+            settings={k: yaml.safe_load(v) for k, v in (_pair(t, "--set") for t in settings or ())},
             device=pick_device(device),
             folder=folder,
             registry=default_registry(plugin or ()),
@@ -221,13 +209,6 @@ def _pair(text: str, option: str) -> tuple[str, str]:
     if not (key and equals and value):
         raise HoigsError(f"{option} {text}: expected {option} NAME=VALUE")
     return key, value
-
-
-def _value(text: str) -> Any:
-    """A setting as a spec would read it."""
-    import yaml
-
-    return yaml.safe_load(text)
 
 
 # `hoigs plugins new`: a package with one component, to be filled with a method of one's own.
@@ -294,7 +275,6 @@ def write_package(name: str, kind: NewKind, out: Path) -> Path:
     Raises:
         HoigsError: the name cannot be that of a package, or the folder is there already.
     """
-    from hoigs.core.errors import HoigsError
     from hoigs.core.registry.component import API
 
     check_name(name, kind)
@@ -326,7 +306,6 @@ def write_package(name: str, kind: NewKind, out: Path) -> Path:
 
 def check_name(name: str, kind: NewKind) -> None:
     """Raise HoigsError unless a distribution, a module, a class and a component can have `name`."""
-    from hoigs.core.errors import HoigsError
     from hoigs.core.registry.registry import default_registry
 
     if not _NAME.fullmatch(name):
@@ -399,8 +378,6 @@ def plugins(
         return
     rows, notes = list_plugins(load=load, files=plugin or ())
     if as_json:
-        import json
-
         typer.echo(json.dumps({"plugins": rows, "notes": notes}, indent=1))
         return
     typer.echo(LINE.format(key="component", status="status", origin="from", text="summary"))
@@ -475,10 +452,9 @@ def list_specs() -> None:
     from hoigs.core.spec.files import builtin_specs, builtin_summary, spec_profiles
 
     for name in builtin_specs():
-        profiles = "".join(f" @{profile}" for profile in spec_profiles(name)[1:])
-        typer.echo(
-            f"{name:<24} {builtin_summary(name)}{f' [{profiles.strip()}]' if profiles else ''}"
-        )
+        profiles = " ".join(f"@{profile}" for profile in spec_profiles(name)[1:])
+        also = f" [{profiles}]" if profiles else ""
+        typer.echo(f"{name:<24} {builtin_summary(name)}{also}")
 
 
 @spec_app.command("check")
@@ -511,7 +487,6 @@ def spec_keys(
 ) -> None:
     """Every key of a spec with its type, default and meaning; those of a component are listed by
     `hoigs plugins show`."""
-    from hoigs.core.errors import SpecError, did_you_mean
     from hoigs.core.registry.settings import describe_settings
     from hoigs.core.spec.schema import KINDS, EntitySpec, Spec
 

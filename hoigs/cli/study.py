@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from hoigs.cli.options import flags
+from hoigs.core.errors import HoigsError
 from hoigs.core.system.files import printable
 from hoigs.studies.options import (
     BatchOptions,
@@ -22,6 +24,7 @@ from hoigs.studies.options import (
 
 if TYPE_CHECKING:
     from hoigs.studies.batch.batch import Batch, Work
+    from hoigs.studies.jobs.job import Job
     from hoigs.studies.jobs.results import Row
 
 
@@ -37,12 +40,10 @@ def compare(
     them.
     """
     where = options.place()
-    from hoigs.core.errors import HoigsError
     from hoigs.studies.compare.data import load_chart, merged_about
     from hoigs.studies.compare.paper import choose_tables
     from hoigs.studies.compare.run import Comparison, run_comparison
     from hoigs.studies.compare.write import write_chart
-    from hoigs.studies.jobs.job import Job
     from hoigs.studies.jobs.results import parse_variants
 
     if not clips and not options.add:
@@ -65,11 +66,8 @@ def compare(
         plugins=tuple(p.resolve() for p in options.plugins),
     )
 
-    def report(job: Job, word: str) -> None:
-        typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
-
-    cells = run_comparison(study, executor=where, limit_s=options.limit_s(), report=report)
-    about = _about_chart(study.settings, study.device, options)
+    cells = run_comparison(study, executor=where, limit_s=options.limit_s(), report=_report)
+    about = _about(study.settings, study.device, options)
     if not clips:  # nothing was run
         about = merged_about({path: made for path, (_, made) in loaded.items()})
     for path in write_chart([*cells, *others], study.out, about, mix_machines=options.mix_machines):
@@ -78,9 +76,11 @@ def compare(
         typer.echo("some trainings are not done; chart.md gives the reason")
 
 
-def _steps(text: str) -> list[int]:
-    from hoigs.core.errors import HoigsError
+def _report(job: Job, word: str) -> None:
+    typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
 
+
+def _steps(text: str) -> list[int]:
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words:
         if not word.isdecimal() or int(word) < 1:
@@ -90,15 +90,15 @@ def _steps(text: str) -> list[int]:
     return list(dict.fromkeys(map(int, words)))
 
 
-def _about_chart(
-    settings: tuple[str, ...], device: str, options: ExecutionOptions
-) -> dict[str, object]:
-    from datetime import UTC, datetime
-
+def _about(
+    settings: tuple[str, ...], device: str, options: ExecutionOptions, **more: str
+) -> dict[str, str]:
+    """How a study was made, for its files."""
     from hoigs.runs.run_folder import versions
 
     return {
         "date": datetime.now(UTC).date().isoformat(),
+        **more,
         "settings": " ".join(settings) or "none",
         "runs at a time": f"{options.jobs}, {options.each()} threads each, on {device}",
         "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
@@ -115,7 +115,6 @@ def stress(*, options: StressOptions) -> None:
     Each case trains on clips that get harder until a spec breaks. Writes stress.md and .json,
     stress-matrix.png and .svg, and stress-curves.png and .svg.
     """
-    from hoigs.studies.jobs.job import Job
     from hoigs.studies.jobs.results import definition, parse_variants
     from hoigs.studies.stress.case import choose_cases
     from hoigs.studies.stress.report import write_stress
@@ -137,33 +136,18 @@ def stress(*, options: StressOptions) -> None:
     )
     where, limit = options.place(), options.limit_s()
 
-    def report(job: Job, word: str) -> None:
-        typer.echo(printable(f"{job.clip_label}/{job.folder.name}: {word}"))
-
-    verdicts = run_stress(study, executor=where, limit_s=limit, report=report, log=typer.echo)
+    verdicts = run_stress(study, executor=where, limit_s=limit, report=_report, log=typer.echo)
     definitions = {row.label: definition(row) for row in study.specs}
-    table = make_table(study.cases, definitions, verdicts, _about_cases(study, options))
+    trainings = (
+        f"{study.steps} steps from {study.points} Gaussians, seeds 0 to {study.seeds - 1}, "
+        f"on built-in clips with {study.base.replace('&', ', ')}"
+    )
+    about = _about(study.settings, study.device, options, trainings=trainings)
+    table = make_table(study.cases, definitions, verdicts, about)
     for path in write_stress(table, study.out):
         typer.echo(f"wrote {path}")
     if any(v.status == "not run" for v in verdicts):
         typer.echo("some trainings are not done; the same command continues them")
-
-
-def _about_cases(study: object, options: ExecutionOptions) -> dict[str, object]:
-    from datetime import UTC, datetime
-
-    from hoigs.runs.run_folder import versions
-    from hoigs.studies.stress.run import StressStudy
-
-    assert isinstance(study, StressStudy)
-    return {
-        "date": datetime.now(UTC).date().isoformat(),
-        "trainings": f"{study.steps} steps from {study.points} Gaussians, seeds 0 to "
-        f"{study.seeds - 1}, on built-in clips with {study.base.replace('&', ', ')}",
-        "settings": " ".join(study.settings) or "none",
-        "runs at a time": f"{options.jobs}, {options.each()} threads each, on {study.device}",
-        "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
-    }
 
 
 # `hoigs batch` and `hoigs work`: many videos or clips, on any number of machines.

@@ -150,11 +150,7 @@ def _protocol(
 
 @torch.no_grad()
 def score_frame(
-    model: SceneModel,
-    frame: Frame,
-    clip: Clip,
-    protocol: Protocol,
-    lpips: Lpips | NotComputed,
+    model: SceneModel, frame: Frame, clip: Clip, protocol: Protocol, lpips: Lpips | NotComputed
 ) -> FrameScores:
     """Render one frame and score every region of it."""
     device = model.device

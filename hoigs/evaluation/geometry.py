@@ -21,7 +21,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.core.system.npz import load_arrays
 from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.evaluation.protocol import NotComputed, Value
+from hoigs.evaluation.protocol import NotComputed, Value, mean_of
 
 # Truth: the exact geometry of a synthetic clip, read from its truth.npz.
 
@@ -75,10 +75,8 @@ class Truth:
 
     def human_at(self, frame: int) -> tuple[Float[Array, "W 3"], Int[Array, "G 3"]]:
         """World vertices of the outer surface, clothes included, metres, and faces."""
-        points, transforms, weights = map(
-            torch.from_numpy, (self.dressed, self.transforms[frame], self.weights)
-        )
-        return skin(points, transforms, weights).numpy(), self.dressed_faces
+        parts = (self.dressed, self.transforms[frame], self.weights)
+        return skin(*map(torch.from_numpy, parts)).numpy(), self.dressed_faces
 
 
 SHAPES = {
@@ -222,7 +220,9 @@ def measure_geometry(model: SceneModel, clip: Clip, positions: Sequence[int]) ->
     truth = read_truth(clip)
     moments = {p: clip.moments[p].to(model.device) for p in positions}
     states = {p: dict(model(m).gaussians) for p, m in moments.items()}
-    measured: dict[str, Value] = {"cd_best": _mean([_cd_best(model, s) for s in states.values()])}
+    measured: dict[str, Value] = {
+        "cd_best": mean_of([_cd_best(model, s) for s in states.values()])[0]
+    }
     measured |= _pose_error(model, clip, truth, states)
     for kind in ("object", "human"):
         measured |= _surface(model, clip, truth, states, kind)
@@ -277,7 +277,7 @@ def _pose_error(
         true_turn = truth.rotations[frame] @ R0.T
         turns.append(float(np.degrees(Rotation.from_matrix(R @ true_turn.T).magnitude())))
         shifts.append(1000 * float(np.linalg.norm(R @ c0 + t - truth.translations[frame])))
-    return dict(zip(names, (_mean(turns), _mean(shifts)), strict=True))
+    return dict(zip(names, (mean_of(turns)[0], mean_of(shifts)[0]), strict=True))
 
 
 def _surface(
@@ -303,7 +303,7 @@ def _surface(
             continue
         error = surface_error(points, *mesh(clip.moments[position].index))
         rows.append((1000 * error.accuracy, 1000 * error.completeness, 1000 * error.chamfer))
-    return {name: _mean([row[i] for row in rows]) for i, name in enumerate(names)}
+    return {name: mean_of([row[i] for row in rows])[0] for i, name in enumerate(names)}
 
 
 def _why_not(model: SceneModel, truth: Truth | NotComputed, kind: str) -> str | None:
@@ -322,8 +322,7 @@ def _no_entity(model: SceneModel, kind: str) -> str:
 
 def _is_solid(gaussians: Gaussians) -> Array:
     solid = (gaussians.opacity_logits.sigmoid() >= SOLID) & gaussians.means.isfinite().all(-1)
-    array: Array = solid.cpu().numpy()
-    return array
+    return solid.cpu().numpy()
 
 
 def _array(gaussians: Gaussians) -> Float[Array, "N 3"]:
@@ -332,11 +331,3 @@ def _array(gaussians: Gaussians) -> Float[Array, "N 3"]:
 
 def _solid(gaussians: Gaussians) -> Float[Array, "N 3"]:
     return _array(gaussians)[_is_solid(gaussians)]
-
-
-def _mean(values: Sequence[Value]) -> Value:
-    numbers = [v for v in values if not isinstance(v, NotComputed)]
-    if numbers:
-        return float(np.mean(numbers))
-    reasons = sorted({v.reason for v in values if isinstance(v, NotComputed)})
-    return NotComputed("; ".join(reasons) or "no frames")

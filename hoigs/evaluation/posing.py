@@ -127,9 +127,8 @@ def blended(model: SceneModel, clip: Clip, position: int, share: float) -> Momen
 
 def _around(clip: Clip, position: int) -> tuple[int, int, float]:
     """The training frames before and after a frame, itself left out, and where it lies between."""
-    others = sorted(
-        (p for p in clip.split["train"] if p != position), key=lambda p: clip.moments[p].time
-    )
+    others = [p for p in clip.split["train"] if p != position]
+    others.sort(key=lambda p: clip.moments[p].time)
     low, high, r = neighbours(clip.moments[position].time, [clip.moments[p].time for p in others])
     return others[low], others[high], r
 

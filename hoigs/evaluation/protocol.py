@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -22,6 +22,15 @@ class NotComputed:
 
 
 Value = float | NotComputed
+
+
+def mean_of(values: Sequence[Value]) -> tuple[Value, int]:
+    """The mean of those that are numbers, and how many there are; the reasons without any."""
+    numbers = [v for v in values if not isinstance(v, NotComputed)]
+    if numbers:
+        return sum(numbers) / len(numbers), len(numbers)
+    reasons = sorted({v.reason for v in values if isinstance(v, NotComputed)})
+    return NotComputed("; ".join(reasons) or "no frames"), 0
 
 
 def to_json(value: Value) -> float | dict[str, str]:

@@ -14,7 +14,7 @@ from hoigs.core.values.clip import Clip
 from hoigs.core.values.shown import html_table
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.geometry import NOTES as GEOMETRY_NOTES
-from hoigs.evaluation.protocol import NotComputed, Protocol, Value, to_json
+from hoigs.evaluation.protocol import NotComputed, Protocol, Value, mean_of, to_json
 from hoigs.metrics.regions import REGIONS
 
 METRICS = ("psnr", "ssim", "lpips", "depth")
@@ -61,12 +61,7 @@ class ViewScores:
         """Mean over the frames that have this score, and their number."""
         if not self.frames:
             return NotComputed(f"the clip has no {self.protocol.split} frames"), 0
-        values = [frame.values[region][metric] for frame in self.frames]
-        numbers = [v for v in values if not isinstance(v, NotComputed)]
-        if numbers:
-            return sum(numbers) / len(numbers), len(numbers)
-        reasons = sorted({v.reason for v in values if isinstance(v, NotComputed)})
-        return NotComputed("; ".join(reasons)), 0
+        return mean_of([frame.values[region][metric] for frame in self.frames])
 
 
 @dataclass(frozen=True)
@@ -125,11 +120,10 @@ class Evaluation:
     scored: Clip | None = field(default=None, repr=False, compare=False)
 
     def view(self, name: str) -> ViewScores:
-        for view in self.views:
-            if view.name == name:
-                return view
-        known = [view.name for view in self.views]
-        raise KeyError(f"no view {name!r} among {known}{did_you_mean(name, known)}")
+        known = {view.name: view for view in self.views}
+        if name not in known:
+            raise KeyError(f"no view {name!r} among {list(known)}{did_you_mean(name, known)}")
+        return known[name]
 
     def score(self, region: str, metric: str, view: str = "test frames") -> Value:
         """The mean of one metric: `evaluation.score("human_object", "psnr")`."""
@@ -155,16 +149,11 @@ class Evaluation:
             for region in REGIONS:
                 for metric in METRICS:
                     value, counted = view.mean(region, metric)
-                    scores.append(
-                        {
-                            "view": view.name,
-                            "region": region,
-                            "metric": metric,
-                            "value": _plain(value),
-                            "frames": counted,
-                            "protocol": view.protocol.of(region).to_dict(),
-                        }
-                    )
+                    protocol = view.protocol.of(region).to_dict()
+                    scores.append({
+                        "view": view.name, "region": region, "metric": metric,
+                        "value": _plain(value), "frames": counted, "protocol": protocol,
+                    })  # fmt: skip
             for frame in view.frames:
                 values = {
                     region: {metric: _plain(v) for metric, v in of_region.items()}
@@ -240,22 +229,14 @@ def timing_table(timing: Timing | NotComputed) -> Table:
 
 def size_table(parts: Sequence[PartSize]) -> Table:
     rows = [(p.name, p.kind, p.gaussians, p.parameters, p.megabytes) for p in parts]
-    columns = zip(*rows, strict=True)
-    _, _, gaussians, parameters, megabytes = (list(c) for c in columns)
-    rows.append(("total", "", sum(gaussians), sum(parameters), sum(megabytes)))
-    cells = [
-        (
-            name,
-            kind,
-            "–" if kind in ("interaction", "decoder") else f"{count:,}",
-            f"{numbers:,}",
-            f"{mb:.2f}",
-        )
-        for name, kind, count, numbers, mb in rows
-    ]
-    columns_ = ("part", "kind", "Gaussians", "parameters", "MB")
+    gaussians, parameters, megabytes = (sum(column) for column in list(zip(*rows))[2:])
+    rows.append(("total", "", gaussians, parameters, megabytes))
+    cells = []
+    for name, kind, count, numbers, mb in rows:
+        shown = "–" if kind in ("interaction", "decoder") else f"{count:,}"
+        cells.append((name, kind, shown, f"{numbers:,}", f"{mb:.2f}"))
     notes = ["Parameters are trained numbers; MB are 10^6 bytes of all stored tensors, unpacked."]
-    return Table("model size", columns_, cells, notes)
+    return Table("model size", ("part", "kind", "Gaussians", "parameters", "MB"), cells, notes)
 
 
 def _plain(value: Value) -> float | dict[str, str]:

@@ -211,8 +211,7 @@ def lpips(
         HoigsError: there are no weights of this net.
     """
     check_pair(image, target)
-    distance: Tensor = _loaded(net).to(image.device)(image, target)
-    return distance
+    return _loaded(net).to(image.device)(image, target)
 
 
 @functools.lru_cache(maxsize=2)

@@ -80,7 +80,6 @@ class _Blur(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, planes: Tensor) -> Tensor:
-        del ctx
         # one group a plane: torch's depthwise kernels are ten times faster here than one plane
         # a batch entry
         count, pad, conv = planes.shape[1], WINDOW // 2, torch.nn.functional.conv2d
@@ -94,9 +93,7 @@ class _Blur(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        del ctx
-        blurred: Tensor = _Blur.apply(gradients[0])
-        return blurred
+        return _Blur.apply(gradients[0])
 
 
 @functools.lru_cache(maxsize=8)

@@ -172,5 +172,4 @@ def _below(arrays: Mapping[str, np.ndarray], place: str) -> dict[str, Any]:
 
 
 def _array(values: Tensor) -> np.ndarray:
-    array: np.ndarray = values.detach().cpu().numpy()
-    return array
+    return values.detach().cpu().numpy()

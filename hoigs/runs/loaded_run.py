@@ -18,11 +18,7 @@ from hoigs.core.registry.registry import Registry, default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.core.values.clip import Clip
-from hoigs.runs.checkpoint import (
-    load_newest,
-    restore_cameras,
-    restore_model,
-)
+from hoigs.runs.checkpoint import load_newest, restore_cameras, restore_model
 from hoigs.runs.choices import pick_device, with_rasterizer
 from hoigs.runs.clip_source import clip_folder, read_clip, recorded_folder, recorded_reader
 from hoigs.runs.kept_clip import load_kept

@@ -159,10 +159,17 @@ class RunFolder:
 
     Args:
         path: the folder; `create` makes it, once all input has been checked.
+
+    Attributes:
+        kept_clip: the clip without its pixels (`hoigs.runs.kept_clip`); older runs have none.
+        windows: files of a training in windows, while it runs.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.spec, self.provenance = path / "spec.yaml", path / "provenance.json"
+        self.metrics, self.checkpoints = path / "metrics.jsonl", path / "checkpoints"
+        self.kept_clip, self.windows = path / "clip.npz", path / "windows"
         self._lock: FolderLock | None = None
         self._created = False
 
@@ -184,36 +191,10 @@ class RunFolder:
         if self._lock is not None:
             self._lock.require_held()
 
-    @property
-    def spec(self) -> Path:
-        return self.path / "spec.yaml"
-
-    @property
-    def metrics(self) -> Path:
-        return self.path / "metrics.jsonl"
-
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def kept_clip(self) -> Path:
-        """The clip without its pixels (`hoigs.runs.kept_clip`); older runs have none."""
-        return self.path / "clip.npz"
-
     def keep_clip_of(self, other: RunFolder) -> None:
         """Take over what another run keeps of its clip, if it keeps anything."""
         if other.kept_clip.is_file():
             shutil.copyfile(other.kept_clip, self.kept_clip)
-
-    @property
-    def windows(self) -> Path:
-        """Files of a training in windows, while it runs."""
-        return self.path / "windows"
-
-    @property
-    def provenance(self) -> Path:
-        return self.path / "provenance.json"
 
     def require(self) -> None:
         """Raise HoigsError unless this is a run."""
@@ -318,10 +299,8 @@ class RunFolder:
 
     def cut_metrics(self, step: int) -> None:
         """Drop records after `step`, which a resumed run writes again, and an unfinished line."""
-        kept = [
-            json.dumps(record) for record in self.read_metrics(StepRecord) if record["step"] <= step
-        ]
-        text = "".join(line + "\n" for line in kept)
+        kept = [record for record in self.read_metrics(StepRecord) if record["step"] <= step]
+        text = "".join(json.dumps(record) + "\n" for record in kept)
         write_whole(self.metrics, text, self.metrics.with_suffix(".part"))
 
     def read_provenance(self) -> dict[str, Any]:

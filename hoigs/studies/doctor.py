@@ -22,10 +22,11 @@ import hoigs
 from hoigs.core.errors import HoigsError, PluginError
 from hoigs.core.interfaces.rasterizer import Rasterizer
 from hoigs.core.registry.manager import Offer, Status
-from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.registry.registry import Registry, default_registry, known_environments
 from hoigs.core.system.files import written_whole
 from hoigs.core.system.safe_replace import refuse_unwritable
 from hoigs.core.system.threads import available_cpus
+from hoigs.core.system.video_files import ENCODERS, pyav
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.metrics.lpips import find_weights
@@ -57,8 +58,6 @@ class Inspected(NamedTuple):
 
 def doctor() -> list[Inspected]:
     """Check the installation; a check that fails is a row, and the others go on."""
-    from hoigs.core.registry.registry import default_registry
-
     devices = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
     checks: dict[str, Callable[[], list[Inspected]]] = {
         "versions": lambda: [Inspected(name, version) for name, version in versions().items()],
@@ -107,10 +106,8 @@ def cuda_rows() -> list[Inspected]:
     if not driver:
         return [*rows, Inspected("cuda", "none", "everything runs on the CPU")]
     if torch.version.cuda is None:
-        note = (
-            f"torch {torch.__version__} is built without CUDA; install one with it to use the GPU"
-        )
-        return [*rows, Inspected("cuda", "none", note)]
+        without = f"torch {torch.__version__} is built without CUDA"
+        return [*rows, Inspected("cuda", "none", f"{without}; install one with it to use the GPU")]
     note = f"it is built for CUDA {torch.version.cuda}, which may need a newer driver"
     return [*rows, Inspected("cuda", "failed: torch cannot use the driver", note)]
 
@@ -124,17 +121,14 @@ def driver_version() -> str:
         if program is None:
             return ""
         command = [program, "--query-gpu=driver_version", "--format=csv,noheader"]
-        text = subprocess.run(
-            command, capture_output=True, text=True, timeout=20, check=False
-        ).stdout
+        asked = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+        text = asked.stdout
     found = re.search(r"\b\d{3,}(\.\d+)+\b", text)
     return found.group() if found else ""
 
 
 def environment_rows() -> list[Inspected]:
     """The environments that estimators run in."""
-    from hoigs.core.registry.registry import known_environments
-
     rows = []
     for environment in known_environments().values():
         state = environment.description().get("versions") or "not installed"
@@ -181,8 +175,6 @@ def training_row(device: str) -> Inspected:
 
 def codec_rows() -> list[Inspected]:
     """The encoders that films need, and the decoders of usual videos, in this build of PyAV."""
-    from hoigs.core.system.video_files import ENCODERS, pyav
-
     try:
         av = pyav()
     except HoigsError as error:

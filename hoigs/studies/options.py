@@ -40,8 +40,7 @@ class ExecutionOptions(Options):
         from hoigs.studies.execution.local import make_executor
 
         if not isinstance(self.executor, str):
-            made: Executor = self.executor
-            return made
+            return self.executor
         return make_executor(self.executor, self.jobs, self.threads, self.address)
 
 

@@ -241,10 +241,7 @@ class Choreographer:
             shoulder, elbow, wrist = SHOULDERS[k], ELBOWS[k], WRISTS[k]
             chest = rotations[:, SPINE[-1]]
             pole = chest @ unit(np.array([0.75 * side, -0.55, -0.45]))
-            bones = (
-                self.rest[elbow] - self.rest[shoulder],
-                self.rest[wrist] - self.rest[elbow],
-            )
+            bones = (self.rest[elbow] - self.rest[shoulder], self.rest[wrist] - self.rest[elbow])
             upper, fore, short = two_bone(places[:, shoulder], wrists[k], pole, bones, -side * Y)
             hand = self._hand_rotation(k, targets.frames[k])
             twist = twist_about(transposed(fore) @ hand, bones[1])

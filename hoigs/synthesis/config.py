@@ -277,10 +277,7 @@ class SceneConfig(ComponentConfig):
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-# CLIPS: the built-in clips by name.
-
-
-# what each clip sets; the rest is a default of SceneConfig
+# the built-in clips by name: what each sets; the rest is a default of SceneConfig
 CLIPS: Mapping[str, Mapping[str, Any]] = {
     "lift-and-swing": {},
     "carry": {

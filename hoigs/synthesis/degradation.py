@@ -188,5 +188,4 @@ def with_shutter(moments: Moments, frames: int) -> Iterator[tuple[TrueView, list
 def mean_image(images: list[UInt8[Array, "H W 3"]]) -> UInt8[Array, "H W 3"]:
     """The mean of sRGB images in linear light, as a sensor adds them."""
     light = np.mean([to_linear(image / 255.0) for image in images], axis=0)
-    mean: UInt8[Array, "H W 3"] = np.round(255 * to_srgb(light)).astype(np.uint8)
-    return mean
+    return np.round(255 * to_srgb(light)).astype(np.uint8)

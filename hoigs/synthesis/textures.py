@@ -279,8 +279,7 @@ def faded(image: Array, contrast: float) -> Array:
     if contrast == 1:
         return image
     mean = image.mean((0, 1))
-    faded: Array = mean + contrast * (image - mean)
-    return faded
+    return mean + contrast * (image - mean)
 
 
 def crate_faces(rng: np.random.Generator, size: int, textured: bool = True) -> list[Array]:

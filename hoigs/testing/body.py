@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -26,9 +26,7 @@ from hoigs.core.values.moment import BodyPose
 from hoigs.testing.checks import CheckList, require, require_close, require_finite
 from hoigs.testing.material import HUMAN, SMPLX_PARENTS, pose_at, tiny_clip
 from hoigs.testing.modules import DeviceSubject, require_true_gradients, unchanged, weighted_sum
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
+from hoigs.testing.runner import Options
 
 
 class BodySubject(DeviceSubject[BodyModel]):

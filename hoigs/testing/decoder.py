@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,7 +12,6 @@ from torch import Tensor
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.decoder import Decoder
 from hoigs.core.interfaces.rasterizer import RenderOutput
-from hoigs.core.spec.train_schema import rate_names
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.moment import Moment
 from hoigs.testing import modules
@@ -21,8 +20,6 @@ from hoigs.testing.material import camera_at, moment_at, tiny_clip
 from hoigs.testing.modules import (
     ModuleSubject,
     perturb,
-    plain_state,
-    require_gradients,
     require_same,
     require_true_gradients,
     seeded,
@@ -30,9 +27,6 @@ from hoigs.testing.modules import (
     unchanged,
     weighted_sum,
 )
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
 
 TIMES = (0.4, 0.0, 1.0, 0.77)
 MARGIN = 4  # pixels from the border of a part within which it may differ from the whole
@@ -67,7 +61,7 @@ class DecoderSubject(ModuleSubject[Decoder]):
     """The component under check."""
 
     def made(
-        self, *, seed: int = 0, dtype: torch.dtype = torch.float32, perturbed: bool = True
+        self, *, seed: int = 0, perturbed: bool = True, dtype: torch.dtype = torch.float32
     ) -> Decoder:
         context = BuildContext(clip=tiny_clip())
         decoder = seeded(lambda: self.cls.from_config(self.config, context), seed)
@@ -95,11 +89,8 @@ class DecoderSubject(ModuleSubject[Decoder]):
         channels = (2 * random(count) - 1) * alpha[..., None] if count else None
         color = random(3) * alpha[..., None] + (1 - alpha[..., None]) * 0.3
         output = RenderOutput(color, alpha, 3 * alpha * random(), channels)
-        return Drawn(
-            output,
-            camera.to(device=self.device, dtype=dtype),
-            moment_at(time, dtype, self.device),
-        )
+        camera = camera.to(device=self.device, dtype=dtype)
+        return Drawn(output, camera, moment_at(time, dtype, self.device))
 
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[Drawn]:
         return [self.drawn(time, dtype=dtype) for time in TIMES]
@@ -113,16 +104,10 @@ CHECKS.check("K02")(modules.keeps_dtype_and_device)
 CHECKS.check("K08")(modules.same_seed_same_module)
 CHECKS.check("K09")(modules.a_deep_copy_is_independent)
 CHECKS.check("K10")(modules.cases_are_independent)
-
-
-def subject(cls: type[Decoder], config: Any, options: Options) -> DecoderSubject:
-    made = DecoderSubject(cls, config, torch.device(options.device))
-    made.made()
-    return made
-
-
-def learns(subject: DecoderSubject) -> str | None:
-    return None if trained(subject.made()) else "it has no parameters"
+CHECKS.check("K05", modules.learns)(modules.every_parameter_gets_a_gradient)
+CHECKS.check("K07")(modules.a_checkpoint_restores_it)
+CHECKS.check("K14")(modules.rates_exist_in_the_spec)
+subject = DecoderSubject.of
 
 
 def reads_channels(subject: DecoderSubject) -> str | None:
@@ -138,9 +123,8 @@ def it_gives_a_picture(subject: DecoderSubject) -> None:
         for case in (whole, whole.part(2, 3, 11, 5), whole.part(0, 0, 1, 1)):
             picture = subject.outputs(decoder, case)["picture"]
             expected = [case.camera.height, case.camera.width, 3]
-            require(
-                list(picture.shape) == expected, f"it is {list(picture.shape)}, expected {expected}"
-            )
+            got = list(picture.shape)
+            require(got == expected, f"it is {got}, expected {expected}")
             require_finite("the picture", picture.detach())
 
 
@@ -167,14 +151,6 @@ def a_part_is_as_in_the_whole(subject: DecoderSubject) -> None:
     require_close("a part of the picture", part[within], cut[within], atol=1e-5)
 
 
-@CHECKS.check("K05", learns)
-def every_parameter_gets_a_gradient(subject: DecoderSubject) -> None:
-    """Every trained parameter gets a gradient from some picture."""
-    decoder = subject.made()
-    losses = (weighted_sum(subject.outputs(decoder, case)) for case in subject.cases())
-    require_gradients(decoder, losses)
-
-
 @CHECKS.check("K06")
 def gradients_are_derivatives(subject: DecoderSubject) -> None:
     """In float64, gradients of parameters, colours and channels agree with differences."""
@@ -188,16 +164,6 @@ def gradients_are_derivatives(subject: DecoderSubject) -> None:
         {**trained(decoder), **leaves},
         lambda: weighted_sum(subject.outputs(decoder, case.with_output(**leaves))),
     )
-
-
-@CHECKS.check("K07")
-def a_checkpoint_restores_it(subject: DecoderSubject) -> None:
-    """The state, saved without pickle, restores everything in a new instance."""
-    decoder, fresh = subject.made(), subject.made(seed=5, perturbed=False)
-    fresh.load_state_dict(plain_state(decoder))
-    case = subject.drawn()
-    expected = subject.outputs(decoder, case)
-    require_same("loaded", subject.outputs(fresh, case), expected, atol=1e-6)
 
 
 @CHECKS.check("K11")
@@ -229,11 +195,3 @@ def time_may_be_a_tensor(subject: DecoderSubject) -> None:
     expected = subject.outputs(decoder, case)
     got = subject.outputs(decoder, replace(case, moment=replace(case.moment, time=time)))
     require_same("with a time in a tensor", got, expected, atol=1e-5)
-
-
-@CHECKS.check("K14")
-def rates_exist_in_the_spec(subject: DecoderSubject) -> None:
-    """Learning rates have names that a spec's train.rates has."""
-    known = rate_names()
-    for prefix, rate in subject.cls.rates.items():
-        require(rate in known, f'rates["{prefix}"] is "{rate}"; train.rates has {known}')

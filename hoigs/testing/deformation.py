@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,7 +25,6 @@ from hoigs.core.interfaces.deformation import (
 )
 from hoigs.core.maths.rotations import quats_to_matrices
 from hoigs.core.model.entity import Entity
-from hoigs.core.spec.train_schema import rate_names
 from hoigs.core.values.gaussians import FIELDS, Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.core.values.tokens import EntityKind, Residual
@@ -58,10 +57,6 @@ from hoigs.testing.modules import (
     weighted_sum,
 )
 
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
-
 RAW = FIELDS
 COUNT = 7
 INSIDE = (0.0, 0.13, 0.5, 0.77, 1.0)  # times of the clip: first and last frame, and between frames
@@ -71,6 +66,8 @@ TRAINED = tuple(i / (FRAMES - 1) for i in range(FRAMES))
 
 class DeformationSubject(ModuleSubject[DeformationModel]):
     """The component under check: for the human if it provides a skeleton, else for the object."""
+
+    times = (*INSIDE, *OUTSIDE)
 
     @cached_property
     def declared(self) -> DeformationModel:
@@ -136,15 +133,16 @@ class DeformationSubject(ModuleSubject[DeformationModel]):
             sh=0.3 * normal(4, 3),
         )
 
-    def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Entity:
-        return self.entity(seed=seed, dtype=dtype)
+    made = entity
+
+    def checked(self, made: Entity) -> DeformationModel:
+        return made.deformation
 
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[float]:
-        del dtype
         return (0.4, 0.0, 0.77, 1.3)
 
     def outputs(self, made: Entity, case: float) -> dict[str, Tensor]:
-        return by_name(self.draw(made, case))
+        return self.draw(made, case).tensors()
 
     def at(self, entity: Entity, time: float) -> Moment:
         return moment_at(time, entity.means.dtype, entity.means.device)
@@ -157,29 +155,20 @@ class DeformationSubject(ModuleSubject[DeformationModel]):
 CHECKS: CheckList[DeformationSubject] = CheckList("D")
 CHECKS.check("D03")(modules.keeps_dtype_and_device)
 CHECKS.check("D05")(modules.cases_are_independent)
+CHECKS.check("D06")(modules.values_are_finite)
 CHECKS.check("D16")(modules.same_seed_same_module)
 CHECKS.check("D17")(modules.a_deep_copy_is_independent)
-
-
-def subject(cls: type[DeformationModel], config: Any, options: Options) -> DeformationSubject:
-    made = DeformationSubject(cls, config, torch.device(options.device))
-    made.declared  # noqa: B018  (raises here when it cannot be built)
-    return made
-
-
-def by_name(gaussians: Gaussians) -> dict[str, Tensor]:
-    return gaussians.tensors()
+CHECKS.check("D31")(modules.rates_exist_in_the_spec)
+subject = DeformationSubject.of
 
 
 def require_same(what: str, got: Gaussians, expected: Gaussians, atol: float = 2e-5) -> None:
     """Every field the same to `atol`, also the signs of quaternions."""
-    modules.require_same(what, by_name(got), by_name(expected), atol)
+    modules.require_same(what, got.tensors(), expected.tensors(), atol)
 
 
 def changed_by(
-    source: list[int],
-    fresh: Sequence[int] = (),
-    offsets: Tensor | None = None,
+    source: list[int], fresh: Sequence[int] = (), offsets: Tensor | None = None
 ) -> TopologyChange:
     """An index map; `fresh` are new rows."""
     marks = torch.zeros(len(source), dtype=torch.bool)
@@ -210,11 +199,8 @@ def provides(what: str) -> Need:
 
 def applies(part: str) -> Need:
     def need(subject: DeformationSubject) -> str | None:
-        return (
-            None
-            if part in subject.declared.residuals
-            else f'it does not declare "{part}" residuals'
-        )
+        known = part in subject.declared.residuals
+        return None if known else f'it does not declare "{part}" residuals'
 
     return need
 
@@ -222,11 +208,6 @@ def applies(part: str) -> Need:
 def leaves_out_some(subject: DeformationSubject) -> str | None:
     missing = {"means", "pose"} - subject.declared.residuals
     return None if missing else "it declares every residual"
-
-
-def has_parameters(subject: DeformationSubject) -> str | None:
-    trained = any(p.requires_grad for p in subject.declared.parameters())
-    return None if trained else "it has no parameters"
 
 
 # D20 to D23: residuals of the interaction are applied or refused as declared.
@@ -249,9 +230,8 @@ def a_displacement_is_added(subject: DeformationSubject) -> None:
     for time in INSIDE:
         plain = subject.draw(entity, time)
         moved = subject.draw(entity, time, Residual(means=mean_residual(entity)))
-        require_close(
-            f"means at {time}", moved.means, plain.means + mean_residual(entity), atol=1e-5
-        )
+        expected = plain.means + mean_residual(entity)
+        require_close(f"means at {time}", moved.means, expected, atol=1e-5)
         require_same(f"at {time}", moved.replace(means=plain.means), plain, atol=1e-6)
 
 
@@ -288,11 +268,10 @@ def residuals_get_gradients(subject: DeformationSubject) -> None:
     every = {"means": mean_residual(entity), "pose": pose_residual(entity)}
     for part in sorted(entity.deformation.residuals):
         leaf = every[part].requires_grad_()
-        loss = weighted_sum(by_name(subject.draw(entity, 0.4, Residual(**{part: leaf}))))
-        found = (
-            torch.autograd.grad(loss, leaf, allow_unused=True)[0] if loss.requires_grad else None
-        )
-        reached = found is not None and bool((found != 0).any())
+        loss = weighted_sum(subject.draw(entity, 0.4, Residual(**{part: leaf})).tensors())
+        if loss.requires_grad:
+            loss.backward()
+        reached = leaf.grad is not None and bool((leaf.grad != 0).any())
         require(reached, f'no gradient reaches the residual of the "{part}"')
 
 
@@ -306,7 +285,7 @@ def inputs_are_not_modified(subject: DeformationSubject) -> None:
     moment = subject.at(entity, 0.4)
     parts = {"means": mean_residual(entity), "pose": pose_residual(entity)}
     residual = {name: x for name, x in parts.items() if name in entity.deformation.residuals}
-    inputs: dict[str, Tensor] = {f"canonical.{n}": x for n, x in by_name(entity.canonical).items()}
+    inputs: dict[str, Tensor] = {f"canonical.{n}": x for n, x in entity.canonical.tensors().items()}
     inputs |= {f"residual.{name}": x for name, x in residual.items()}
     for name, pose in moment.poses.items():
         fields = {n: x for n, x in vars(pose).items() if isinstance(x, Tensor)}
@@ -314,9 +293,8 @@ def inputs_are_not_modified(subject: DeformationSubject) -> None:
     with unchanged("", inputs), torch.no_grad():
         entity.deformation(entity.canonical, moment, Residual(**residual))
     with unchanged("", inputs):
-        weighted_sum(
-            by_name(entity.deformation(entity.canonical, moment, Residual(**residual)))
-        ).backward()
+        drawn = entity.deformation(entity.canonical, moment, Residual(**residual))
+        weighted_sum(drawn.tensors()).backward()
 
 
 @CHECKS.check("D24")
@@ -341,20 +319,12 @@ def values_are_finite_at_every_stage(subject: DeformationSubject) -> None:
         entity.deformation.set_progress(progress)
         for time in INSIDE:
             output = subject.draw(entity, time)
-            for name, value in by_name(output).items():
+            for name, value in output.tensors().items():
                 require_finite(f"{name} at {time}, {progress:.0%} done", value)
-            require_finite_gradients(entity, weighted_sum(by_name(output)))
+            require_finite_gradients(entity, weighted_sum(output.tensors()))
 
 
-@CHECKS.check("D31")
-def rates_exist_in_the_spec(subject: DeformationSubject) -> None:
-    """Learning rates have names that a spec's train.rates has."""
-    known = rate_names()
-    for prefix, rate in subject.cls.rates.items():
-        require(rate in known, f'rates["{prefix}"] is "{rate}"; train.rates has {known}')
-
-
-@CHECKS.check("D33", has_parameters)
+@CHECKS.check("D33", modules.learns)
 @torch.no_grad()
 def no_stale_caches(subject: DeformationSubject) -> None:
     """After an optimizer step, the output has no values from before it."""
@@ -399,7 +369,7 @@ def shapes_for_any_number(subject: DeformationSubject) -> None:
         entity = subject.entity(count)
         output = subject.draw(entity, 0.4)
         shapes = {name: x.shape for name, x in entity.canonical.tensors().items()}
-        for name, x in by_name(output).items():
+        for name, x in output.tensors().items():
             expected = shapes.get(name, (count, x.shape[-1]))  # channels: any number
             require(
                 x.shape == expected,
@@ -416,18 +386,6 @@ def order_of_rows_does_not_matter(subject: DeformationSubject) -> None:
     for time in INSIDE:
         expected = subject.draw(plain, time)[order]
         require_same(f"permuted, at {time}", subject.draw(permuted, time), expected)
-
-
-@CHECKS.check("D06")
-def values_are_finite(subject: DeformationSubject) -> None:
-    """Values and gradients are finite inside the clip, at its ends and outside, also untrained."""
-    for perturbed in (False, True):
-        entity = subject.entity(perturbed=perturbed)
-        for time in (*INSIDE, *OUTSIDE):
-            output = subject.draw(entity, time)
-            for name, value in by_name(output).items():
-                require_finite(f"{name} at {time}", value)
-            require_finite_gradients(entity, weighted_sum(by_name(output)))
 
 
 # D09: continuity in time.
@@ -485,9 +443,8 @@ def evolved(
     found: list[Mapping[str, AxisChange]] = []
     if type(entity.deformation).evolve is DeformationModel.evolve:
         return found
-    perturb(
-        entity.deformation, seed=4, size=1e-3
-    )  # a deformation may evolve only parameters that have moved
+    # a deformation may evolve only parameters that have moved
+    perturb(entity.deformation, seed=4, size=1e-3)
     if moments is not None:
         moments.values = {n: p.detach().clone() for n, p in moments.parameters.items()}
     canonical = entity.canonical.detach()
@@ -523,7 +480,7 @@ def statistics_of(subject: DeformationSubject, entity: Entity, frame: int) -> St
 
 def loss(subject: DeformationSubject, entity: Entity, time: float) -> Tensor:
     """A loss of everything that a deformation computes at a moment."""
-    values = by_name(subject.draw(entity, time))
+    values = subject.draw(entity, time).tensors()
     model, moment = entity.deformation, subject.at(entity, time)
     if "velocity" in model.provides and isinstance(model, ProvidesVelocity):
         values["velocity"] = model.velocity(entity.canonical, moment)
@@ -532,7 +489,7 @@ def loss(subject: DeformationSubject, entity: Entity, time: float) -> Tensor:
     return weighted_sum(values)
 
 
-@CHECKS.check("D07", has_parameters)
+@CHECKS.check("D07", modules.learns)
 def every_parameter_gets_a_gradient(subject: DeformationSubject) -> None:
     """Every trained parameter gets a gradient from some moment, once heads are not zero."""
     entity = subject.entity(perturbed=False)
@@ -554,7 +511,7 @@ def gradients_are_derivatives(subject: DeformationSubject) -> None:
     for time in (0.37, 0.81):
         require_true_gradients(
             leaves,
-            lambda time=time: weighted_sum(by_name(subject.draw(entity, time))),  # type: ignore[misc]
+            lambda time=time: weighted_sum(subject.draw(entity, time).tensors()),  # type: ignore[misc]
             cut=sorted(entity.deformation.cut_gradients),
         )
 
@@ -563,11 +520,11 @@ def gradients_are_derivatives(subject: DeformationSubject) -> None:
 def canonical_fields_are_trained_or_owned(subject: DeformationSubject) -> None:
     """Every field of the canonical Gaussians gets a gradient, or is declared in `owns`."""
     entity = subject.entity()
-    names = set(by_name(entity.canonical))
+    names = set(entity.canonical.tensors())
     unknown = sorted(entity.deformation.owns - names)
     require(not unknown, f"owns names {unknown}, fields are {sorted(names)}")
     entity.zero_grad()
-    weighted_sum(by_name(subject.draw(entity, 0.4))).backward()
+    weighted_sum(subject.draw(entity, 0.4).tensors()).backward()
     for name in sorted(names - entity.deformation.owns):
         slope = entity.get_parameter(name).grad
         reached = slope is not None and bool((slope != 0).any())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,10 +15,7 @@ from hoigs.core.values.topology import TopologyChange
 from hoigs.testing.checks import CheckList, require, require_close, require_finite, require_zero
 from hoigs.testing.material import OBJECT, tiny_clip
 from hoigs.testing.modules import DeviceSubject, require_penalties, unchanged
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
+from hoigs.testing.runner import Options
 
 COUNT = 60
 TOTAL = 2000  # steps of the simulated run
@@ -207,9 +204,8 @@ def values_are_finite(subject: DensitySubject) -> None:
             decision = subject.refine(control, step, canonical, seen)
             if decision is not None and decision.canonical is not None:
                 for name in RAW:
-                    require_finite(
-                        f"{name} of the new canonical Gaussians", getattr(decision.canonical, name)
-                    )
+                    value = getattr(decision.canonical, name)
+                    require_finite(f"{name} of the new canonical Gaussians", value)
                 break
 
 
@@ -220,10 +216,8 @@ def no_gaussians_are_accepted(subject: DensitySubject) -> None:
     empty = subject.cloud(0)
     for step in range(0, TOTAL + 1, 50):
         decision = subject.refine(control, step, empty, DensityStatistics.zeros(0, subject.device))
-        grown = (
-            decision is not None and decision.canonical is not None and len(decision.canonical) > 0
-        )
-        require(not grown, "it adds Gaussians to an empty entity")
+        new = None if decision is None else decision.canonical
+        require(new is None or len(new) == 0, "it adds Gaussians to an empty entity")
         control.perturb(empty, step=step, total_steps=TOTAL, rate=1e-3)
 
 

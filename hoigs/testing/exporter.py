@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,10 +20,7 @@ from hoigs.core.reporting import Progress, no_progress
 from hoigs.testing.checks import CheckError, CheckList, ComponentSubject, require
 from hoigs.testing.material import HUMAN, OBJECT, TinyBody, moment_at, tiny_clip, tiny_scene
 from hoigs.testing.modules import unchanged
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
+from hoigs.testing.runner import Options
 
 TIMES = (0.0, 0.5, 1.0)
 
@@ -41,10 +38,7 @@ class ExporterSubject(ComponentSubject[Exporter]):
         return ExportRequest(tiny_scene(), tiny_clip(), moments, entities, bodies)
 
     def export(
-        self,
-        out: Path,
-        request: ExportRequest | None = None,
-        progress: Progress = no_progress,
+        self, out: Path, request: ExportRequest | None = None, progress: Progress = no_progress
     ) -> Exported:
         return self.exporter().export(request or self.request(), out, progress)
 
@@ -72,7 +66,6 @@ CHECKS: CheckList[ExporterSubject] = CheckList("X")
 
 
 def subject(cls: type[Exporter], config: Any, options: Options) -> ExporterSubject:
-    del options
     made = ExporterSubject(cls, config)
     made.exporter()
     return made
@@ -113,11 +106,7 @@ def nothing_is_written_elsewhere(subject: ExporterSubject) -> None:
         subject.export(place / "scene")
         root = place.parent
         after = {n: d for n, d in contents(root).items() if not n.startswith("exports/scene")}
-        before = {
-            "exports": b"",
-            "exports/other.txt": b"another file",
-            "working-directory": b"",
-        }
+        before = {"exports": b"", "exports/other.txt": b"another file", "working-directory": b""}
         changed = sorted(n for n in before | after if before.get(n) != after.get(n))
         require(not changed, f"exporting changed {changed} beside the new folder")
 
@@ -165,7 +154,6 @@ def _stopped_export(subject: ExporterSubject, out: Path, stop: int) -> None:
 
     def progress(done: float, text: str) -> None:
         nonlocal count
-        del done, text
         if count == stop:
             raise _StoppedError
         count += 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -16,7 +15,7 @@ from hoigs.core.model.entity import Entity
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.tokens import Tokens
 from hoigs.testing import modules
-from hoigs.testing.checks import CheckList, require, require_close, require_finite
+from hoigs.testing.checks import CheckList, require, require_close
 from hoigs.testing.deformation import apply, changed_by, follow
 from hoigs.testing.material import OBJECT, TinyMotion, moment_at, object_track, tiny_clip
 from hoigs.testing.modules import (
@@ -24,17 +23,12 @@ from hoigs.testing.modules import (
     Moments,
     perturb,
     plain_state,
-    require_finite_gradients,
     require_gradients,
     require_true_gradients,
     seeded,
     trained,
     weighted_sum,
 )
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
 
 COUNT = 7
 INSIDE = (0.0, 0.13, 0.5, 1.0)
@@ -43,6 +37,8 @@ OUTSIDE = (-0.2, 1.2)
 
 class FeaturesSubject(ModuleSubject[FeatureExtractor]):
     """The component under check; it describes an entity that moves."""
+
+    times = (*INSIDE, *OUTSIDE)
 
     def entity(
         self,
@@ -63,15 +59,16 @@ class FeaturesSubject(ModuleSubject[FeatureExtractor]):
 
         entity = seeded(make, seed)
         if perturbed:
-            assert entity.features is not None
-            perturb(entity.features)
+            perturb(self.checked(entity))
         return entity.to(device=self.device, dtype=dtype).eval()
 
-    def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> Entity:
-        return self.entity(seed=seed, dtype=dtype)
+    made = entity
+
+    def checked(self, made: Entity) -> FeatureExtractor:
+        assert made.features is not None
+        return made.features
 
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[float]:
-        del dtype
         return (0.4, 0.0, 0.77, 1.2)
 
     def outputs(self, made: Entity, case: float) -> dict[str, Tensor]:
@@ -88,12 +85,8 @@ CHECKS.check("F02")(modules.keeps_dtype_and_device)
 CHECKS.check("F10")(modules.same_seed_same_module)
 CHECKS.check("F11")(modules.a_deep_copy_is_independent)
 CHECKS.check("F12")(modules.cases_are_independent)
-
-
-def subject(cls: type[FeatureExtractor], config: Any, options: Options) -> FeaturesSubject:
-    made = FeaturesSubject(cls, config, torch.device(options.device))
-    made.entity()
-    return made
+CHECKS.check("F03")(modules.values_are_finite)
+subject = FeaturesSubject.of
 
 
 def by_name(tokens: Tokens) -> dict[str, Tensor]:
@@ -104,13 +97,6 @@ def require_same(what: str, got: Tokens, expected: Tokens, atol: float = 1e-5) -
     modules.require_same(what, by_name(got), by_name(expected), atol)
 
 
-def learns(subject: FeaturesSubject) -> str | None:
-    features = subject.entity().features
-    assert features is not None
-    trained = any(p.requires_grad for p in features.parameters())
-    return None if trained else "it has no parameters"
-
-
 # F01 to F07 and F13: shapes, values, gradients, positions and number of tokens.
 
 
@@ -119,27 +105,14 @@ def as_many_positions_as_features(subject: FeaturesSubject) -> None:
     """M tokens are features [M, width] and positions [M, 3], for 1 and for 7 Gaussians."""
     for count in (1, 7):
         entity = subject.entity(count)
-        tokens, features = subject.tokens(entity, 0.4), entity.features
-        assert features is not None
-        number, width = len(tokens.features), features.width
+        tokens = subject.tokens(entity, 0.4)
+        number, width = len(tokens.features), subject.checked(entity).width
         got = list(tokens.features.shape)
         require(got == [number, width], f"features are {got}, width is {width}")
         require(
             tokens.positions.shape == (number, 3),
             f"{number} tokens have positions {list(tokens.positions.shape)}",
         )
-
-
-@CHECKS.check("F03")
-def values_are_finite(subject: FeaturesSubject) -> None:
-    """Tokens and their gradients are finite inside the clip, at its ends and outside."""
-    for perturbed in (False, True):
-        entity = subject.entity(perturbed=perturbed)
-        for time in (*INSIDE, *OUTSIDE):
-            tokens = by_name(subject.tokens(entity, time))
-            for name, x in tokens.items():
-                require_finite(f"{name} at {time}", x)
-            require_finite_gradients(entity, weighted_sum(tokens))
 
 
 @CHECKS.check("F04")
@@ -154,24 +127,22 @@ def order_of_gaussians_does_not_matter(subject: FeaturesSubject) -> None:
     require_same("permuted", got, expected)
 
 
-@CHECKS.check("F05", learns)
+@CHECKS.check("F05", modules.learns)
 def every_parameter_gets_a_gradient(subject: FeaturesSubject) -> None:
     """Every trained parameter gets a gradient from some moment."""
     entity = subject.entity()
-    assert entity.features is not None
     times = [i / 16 for i in range(17)]
     losses = (weighted_sum({"features": subject.tokens(entity, t).features}) for t in times)
-    require_gradients(entity.features, losses)
+    require_gradients(subject.checked(entity), losses)
 
 
-@CHECKS.check("F06", learns)
+@CHECKS.check("F06", modules.learns)
 def gradients_are_derivatives(subject: FeaturesSubject) -> None:
     """In float64, the gradient of every parameter is the slope of the tokens."""
     entity = subject.entity(dtype=torch.float64)
-    assert entity.features is not None
     for time in (0.37, 0.81):
         require_true_gradients(
-            trained(entity.features),
+            trained(subject.checked(entity)),
             lambda time=time: weighted_sum(by_name(subject.tokens(entity, time))),  # type: ignore[misc]
         )
 
@@ -198,8 +169,8 @@ def as_many_tokens_as_declared(subject: FeaturesSubject) -> None:
     """As many tokens as `tokens` declares: one for each Gaussian or body part, or "any" number."""
     for count in (1, 7, 16, 20):
         entity = subject.entity(count)
-        assert entity.features is not None
-        declared, number = entity.features.tokens, len(subject.tokens(entity, 0.4).positions)
+        declared = subject.checked(entity).tokens
+        number = len(subject.tokens(entity, 0.4).positions)
         expected = {"gaussian": count, "part": len(PART_NAMES), "any": number}[declared]
         require(
             number == expected,
@@ -214,10 +185,9 @@ def as_many_tokens_as_declared(subject: FeaturesSubject) -> None:
 def rows_and_moments_follow(subject: FeaturesSubject) -> None:
     """After density control, tokens and optimizer moments follow the rows."""
     before, after = subject.entity(), subject.entity()
-    assert after.features is not None
     source = [0, 2, 3, 5, 2, 6, 1, 4]
     change = changed_by(source, fresh=[4])
-    names = {f"features.{n}": p for n, p in trained(after.features).items()}
+    names = {f"features.{n}": p for n, p in trained(subject.checked(after)).items()}
     moments = Moments(names)
     follow(after, change, moments)
     apply(after, change)

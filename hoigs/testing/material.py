@@ -287,13 +287,11 @@ class TinyMotion(DeformationModel):
         return canonical.replace(means=means)
 
     def velocity(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
-        del canonical, moment
         return self.tangents[:, -1]
 
     def posed_field(
         self, canonical: Gaussians, moment: Moment
     ) -> tuple[Float[Tensor, "V D"], Float[Tensor, "V 3"]]:
-        del canonical
         places = self._body[0](moment.poses[HUMAN]).vertices
         return self.codes + moment.time, places
 

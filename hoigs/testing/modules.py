@@ -9,13 +9,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from hoigs.core.spec.train_schema import rate_names
 from hoigs.core.values.topology import AxisChange, TopologyChange
 from hoigs.testing.checks import (
     CheckError,
@@ -25,6 +26,7 @@ from hoigs.testing.checks import (
     require_close,
     require_finite,
 )
+from hoigs.testing.runner import Options
 
 Made = TypeVar("Made")
 Module = TypeVar("Module", bound=nn.Module)
@@ -44,9 +46,24 @@ class DeviceSubject(ComponentSubject[Component]):
 class ModuleSubject(DeviceSubject[Component], ABC):
     """A component that becomes a torch module: what the checks that kinds share run on."""
 
+    times: Sequence[float] = ()  # of the cases in which values have to be finite
+
+    @classmethod
+    def of(cls, component: type[Component], config: Any, options: Options) -> Self:
+        """The subject of a component; raises where that cannot be built."""
+        subject = cls(component, config, torch.device(options.device))
+        subject.made()
+        return subject
+
     @abstractmethod
-    def made(self, *, seed: int = 0, dtype: torch.dtype = torch.float32) -> nn.Module:
-        """The module, in eval mode, with perturbed parameters."""
+    def made(
+        self, *, seed: int = 0, perturbed: bool = True, dtype: torch.dtype = torch.float32
+    ) -> Any:
+        """The module, in eval mode; by default with perturbed parameters."""
+
+    def checked(self, made: Any) -> nn.Module:
+        """The component itself within what `made` gives."""
+        return made
 
     @abstractmethod
     def cases(self, dtype: torch.dtype = torch.float32) -> Sequence[Any]:
@@ -281,6 +298,43 @@ def unchanged(what: str, tensors: Mapping[str, Tensor] | Callable[[], Mapping[st
 
 
 # Checks that deformations, features and interactions share, each under a number of its own.
+
+
+def learns(subject: ModuleSubject[Any]) -> str | None:
+    return None if trained(subject.checked(subject.made())) else "it has no parameters"
+
+
+def rates_exist_in_the_spec(subject: ModuleSubject[Any]) -> None:
+    """Learning rates have names that a spec's train.rates has."""
+    known = rate_names()
+    for prefix, rate in subject.cls.rates.items():
+        require(rate in known, f'rates["{prefix}"] is "{rate}"; train.rates has {known}')
+
+
+def values_are_finite(subject: ModuleSubject[Any]) -> None:
+    """Values and gradients are finite inside the clip, at its ends and outside, also untrained."""
+    for perturbed in (False, True):
+        made = subject.made(perturbed=perturbed)
+        for time in subject.times:
+            outputs = subject.outputs(made, time)
+            for name, x in outputs.items():
+                require_finite(f"{name} at {time}", x)
+            require_finite_gradients(made, weighted_sum(outputs))
+
+
+def every_parameter_gets_a_gradient(subject: ModuleSubject[Any]) -> None:
+    """Every trained parameter gets a gradient from some input, once heads are not zero."""
+    made = subject.made()
+    losses = (weighted_sum(subject.outputs(made, case)) for case in subject.cases())
+    require_gradients(made, losses)
+
+
+def a_checkpoint_restores_it(subject: ModuleSubject[Any]) -> None:
+    """The state, saved without pickle, restores everything in a new instance."""
+    made, fresh = subject.made(), subject.made(seed=5, perturbed=False)
+    fresh.load_state_dict(plain_state(made))
+    case = subject.cases()[0]
+    require_same("loaded", subject.outputs(fresh, case), subject.outputs(made, case), atol=1e-6)
 
 
 def keeps_dtype_and_device(subject: ModuleSubject[Any]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,9 +16,7 @@ from hoigs.core.model.scene import SceneModel
 from hoigs.testing.checks import CheckError, CheckList, ComponentSubject, require, require_finite
 from hoigs.testing.material import HUMAN, OBJECT, tiny_clip, tiny_scene
 from hoigs.testing.modules import unchanged
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
+from hoigs.testing.runner import Options
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,6 @@ CHECKS: CheckList[ObjectiveSubject] = CheckList("L")
 
 
 def subject(cls: type[Objective], config: Any, options: Options) -> ObjectiveSubject:
-    del options
     made = ObjectiveSubject(cls, config)
     made.objective()
     return made

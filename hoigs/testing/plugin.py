@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -22,10 +22,7 @@ from hoigs.core.registry.manager import HOOK, Offer, Status, normal_name
 from hoigs.core.registry.registry import Registry
 from hoigs.core.system.environments import PYTHON
 from hoigs.testing.checks import CheckError, CheckList, require
-from hoigs.testing.runner import KINDS
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
+from hoigs.testing.runner import KINDS, Options
 
 
 @dataclass(frozen=True)
@@ -97,9 +94,8 @@ def _probe(steps: Sequence[str], first: Sequence[str], hook: str | None) -> dict
     """What importing each of `steps` does, in one process that has imported `first`."""
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder) / "job.json", Path(folder) / "result.json"
-        job.write_text(
-            json.dumps({"path": sys.path, "first": first, "hook": hook, "steps": list(steps)})
-        )
+        task = {"path": sys.path, "first": first, "hook": hook, "steps": list(steps)}
+        job.write_text(json.dumps(task))
         command = [*PYTHON, str(PROBE), str(result), str(job)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if not result.is_file():

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from PIL import Image
@@ -28,10 +28,7 @@ from hoigs.testing.checks import (
     require_finite,
 )
 from hoigs.testing.material import write_tiny_clip
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
+from hoigs.testing.runner import Options
 
 IMAGES = (".png", ".jpg", ".jpeg")
 
@@ -144,12 +141,9 @@ def foreign_folders_are_refused(subject: ReaderSubject) -> None:
     with tempfile.TemporaryDirectory() as root:
         for folder in foreign_folders(Path(root)):
             message = refusal(subject.reader(), folder)
-            require(
-                message is not None, f"read({folder.name}) returns a clip, expected a ClipError"
-            )
-            require(
-                folder.name in (message or ""), f"the error does not name the folder: {message}"
-            )
+            if message is None:
+                raise CheckError(f"read({folder.name}) returns a clip, expected a ClipError")
+            require(folder.name in message, f"the error does not name the folder: {message}")
 
 
 @CHECKS.check("C04", has_folder)
@@ -158,22 +152,18 @@ def one_error_names_all_absent_files(subject: ReaderSubject) -> str:
     with subject.folder() as folder:
         reader = subject.reader()
         reader.read(folder)
-        needed = [path for path in files_of(folder) if _is_needed(reader, folder, path)]
+        states = {path: _needed(reader, folder, path) for path in files_of(folder)}
+        needed = [path for path, (fails, _) in states.items() if fails]
         # without these files the folder must still match, or there is no error to check
-        absent = [path for path in needed if _still_matches(reader, folder, path)]
+        absent = [path for path in needed if states[path][1]]
         for path in absent:
             path.rename(path.with_name(path.name + ".away"))
         message = refusal(subject.reader(), folder) if absent else ""
-        require(
-            message is not None, f"without {len(absent)} required files, it still returns a clip"
-        )
-        unnamed = [
-            str(p.relative_to(folder)) for p in absent if not _names(message or "", p, folder)
-        ]
-        require(
-            not unnamed,
-            f"{len(absent)} files are absent, the error does not name {unnamed[:4]}: {message}",
-        )
+        if message is None:
+            raise CheckError(f"without {len(absent)} required files, it still returns a clip")
+        unnamed = [str(p.relative_to(folder)) for p in absent if not _names(message, p, folder)]
+        why = f"{len(absent)} files are absent, the error does not name {unnamed[:4]}: {message}"
+        require(not unnamed, why)
     return f"{len(absent)} of {len(needed)} required files can be absent while the layout matches"
 
 
@@ -194,14 +184,11 @@ def _without(path: Path) -> Iterator[None]:
         away.rename(path)
 
 
-def _is_needed(reader: ClipReader, folder: Path, path: Path) -> bool:
+def _needed(reader: ClipReader, folder: Path, path: Path) -> tuple[bool, bool]:
+    """Whether reading fails without a file, and whether the folder still matches then."""
     with _without(path):
-        return refusal(reader, folder) is not None
-
-
-def _still_matches(reader: ClipReader, folder: Path, path: Path) -> bool:
-    with _without(path):
-        return bool(reader.matches(folder))
+        fails = refusal(reader, folder) is not None
+        return fails, fails and bool(reader.matches(folder))
 
 
 def refusal(reader: ClipReader, folder: Path) -> str | None:
@@ -285,9 +272,8 @@ def reading_writes_nothing(subject: ReaderSubject) -> None:
             require(same, f"image {position}, read twice, differs")
         require(torch.equal(first.points, second.points), "points, read twice, differ")
         after = {path: path.read_bytes() for path in files_of(folder)}
-        changed = [
-            str(p.relative_to(folder)) for p in {*before, *after} if before.get(p) != after.get(p)
-        ]
+        other = [path for path in {*before, *after} if before.get(path) != after.get(path)]
+        changed = [str(path.relative_to(folder)) for path in other]
         require(not changed, f"reading changed {changed}")
 
 

@@ -78,16 +78,16 @@ class Candidate:
         """The subject of its kind's checks; the exception where it cannot be built."""
         package = importlib.import_module(KINDS[kind_of(self.key)])
         try:
-            config = self.registry.config_class(self.key).model_validate(
-                dict(self.options.settings)
-            )
+            settings = dict(self.options.settings)
+            config = self.registry.config_class(self.key).model_validate(settings)
             return package.subject(self.registry.get(self.key), config, self.options)
         except Exception as error:  # a plugin may raise anything
             return error
 
     def checks(self) -> list[Check[Any]]:
         """The P checks and those of its kind."""
-        return checks_of(self.key)
+        packages = [PLUGIN, *filter(None, [KINDS.get(kind_of(self.key))])]
+        return [check for name in packages for check in importlib.import_module(name).CHECKS]
 
     def result(self, check: Check[Any], expected: str | None = None) -> Result:
         """Run one of `checks`."""
@@ -107,12 +107,6 @@ class Candidate:
 
 def kind_of(key: str) -> str:
     return key.partition(":")[0]
-
-
-def checks_of(key: str) -> list[Check[Any]]:
-    """The checks for a key: those of all plugins, then those of its kind."""
-    packages = [PLUGIN, *([KINDS[kind_of(key)]] if kind_of(key) in KINDS else [])]
-    return [check for name in packages for check in importlib.import_module(name).CHECKS]
 
 
 def check(

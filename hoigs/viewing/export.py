@@ -172,9 +172,8 @@ def write_zip(folder: Path, path: Path) -> None:
     """All files of a folder, without dates: the same files give the same bytes."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(p for p in folder.rglob("*") if p.is_file() and p != path):
-            archive.writestr(
-                zipfile.ZipInfo(file.relative_to(folder).as_posix()), file.read_bytes()
-            )
+            name = zipfile.ZipInfo(file.relative_to(folder).as_posix())
+            archive.writestr(name, file.read_bytes())
 
 
 def _sheet_of(target: Path) -> Path:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from PIL import Image, ImageColor, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from hoigs.core.errors import HoigsError, did_you_mean
@@ -28,7 +29,7 @@ from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.options import RenderOptions
 from hoigs.viewing.paths import View, film_path, frames_shown, rate_of
 from hoigs.viewing.playback import Mode, Playback
-from hoigs.viewing.viewer.panes import placed
+from hoigs.viewing.viewer.panes import nearest_position, placed
 
 # Pictures of films: size, background, dithering, and the video beside them.
 
@@ -45,8 +46,7 @@ def dithered(color: Float[Tensor, "H W C"], index: int = 0) -> UInt8[np.ndarray,
     y, x = np.mgrid[:height, :width] + 5.588238 * (index % 64)
     noise = np.modf(52.9829189 * np.modf(0.06711056 * x + 0.00583715 * y)[0])[0]
     value = color.detach().clamp(0, 1).cpu().numpy().astype(np.float64) * 255
-    steps: np.ndarray = np.floor(value + noise[..., None]).clip(0, 255).astype(np.uint8)
-    return steps
+    return np.floor(value + noise[..., None]).clip(0, 255).astype(np.uint8)
 
 
 def fitted(camera: Camera, width: int | None, height: int | None) -> Camera:
@@ -75,8 +75,6 @@ def read_background(text: str, camera: Camera) -> Tensor:
     Raises:
         HoigsError: neither a colour nor an image file.
     """
-    from PIL import Image, ImageColor, UnidentifiedImageError
-
     try:
         return torch.tensor(ImageColor.getrgb(text)[:3]) / 255.0
     except ValueError:
@@ -95,11 +93,7 @@ def read_background(text: str, camera: Camera) -> Tensor:
 
 
 def source_frame(
-    clip: Clip,
-    frame: float,
-    camera: Camera,
-    channels: int,
-    shape: tuple[int, int] | None = None,
+    clip: Clip, frame: float, camera: Camera, channels: int, shape: tuple[int, int] | None = None
 ) -> UInt8[np.ndarray, "H W C"]:
     """The nearest frame of the video, as large as the picture beside it.
 
@@ -107,8 +101,7 @@ def source_frame(
         shape: width and height into which frames of another size are fitted whole first, as the
             film's cameras were.
     """
-    nearest = min(range(len(clip)), key=lambda i: abs(clip.moments[i].index - frame))
-    own = clip.store.image(nearest).numpy()
+    own = clip.store.image(nearest_position(clip, frame)).numpy()
     if shape is not None and shape != (own.shape[1], own.shape[0]):
         own = placed(own, shape)
     image = _filling(own, camera.width, camera.height)
@@ -120,8 +113,6 @@ def source_frame(
 
 def _filling(image: UInt8[np.ndarray, "h w 3"], width: int, height: int) -> Float[Tensor, "H W 3"]:
     """An image at a size, in [0, 1]; what does not fit is cut at both ends."""
-    from PIL import Image, ImageOps
-
     fit = ImageOps.fit(Image.fromarray(image), (width, height), Image.Resampling.LANCZOS)
     return torch.from_numpy(np.array(fit)).float() / 255.0
 
@@ -235,9 +226,8 @@ def _draw(
     report: Progress,
 ) -> Film:
     camera, clear = film[0][1], options.background == TRANSPARENT
-    behind = (
-        None if clear or options.background is None else read_background(options.background, camera)
-    )
+    given = None if clear else options.background
+    behind = None if given is None else read_background(given, camera)
     play = playback_of(loaded.model, film, options.entities, behind, copied=False)
     shown = frames_shown(loaded.clip, film) if options.compare else []
     drawn, draw_s = 0, 0.0

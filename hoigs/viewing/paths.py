@@ -248,16 +248,12 @@ def bullet_time(
     count = max(2, round(BULLET_SECONDS * fps))
     for i in range(count):
         share = i / count
-        yaw = math.radians(BULLET_DEGREES) * math.sin(2 * math.pi * _eased(share))
+        eased = share * share * (3 - 2 * share)  # slow at both ends
+        yaw = math.radians(BULLET_DEGREES) * math.sin(2 * math.pi * eased)
         around.append((still, turned(camera, center, axis_angle_to_matrices(up * yaw))))
     plays = [(f, (moment_between(clip, f), camera_between(clip, f))) for f in frames]
     before = [view for f, view in plays if f <= stop]
     return [*before, *around, *(view for f, view in plays if f > stop)]
-
-
-def _eased(share: float) -> float:
-    """Slow at both ends, in [0, 1]."""
-    return share * share * (3 - 2 * share)
 
 
 @torch.no_grad()

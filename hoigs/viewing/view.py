@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.options import verb
@@ -180,9 +179,7 @@ class LiveView:
     def __enter__(self) -> LiveView:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._process is None:
             return
         assert self._process.stdin is not None

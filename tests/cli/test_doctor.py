@@ -74,9 +74,7 @@ def registry(tmp_path, monkeypatch):
         manager = PluginManager({})
         manager.load_file(path)
         made = Registry(manager)
-        for module in ("registry",):
-            name = f"hoigs.core.registry.{module}.default_registry"
-            monkeypatch.setattr(name, lambda: made)
+        monkeypatch.setattr("hoigs.studies.doctor.default_registry", lambda: made)
         return made
 
     return make

@@ -32,10 +32,7 @@ def test_json_is_all_of_stdout(capsys):
     (table,) = json.loads(said.out)
     assert table == {
         "title": "scores",
-        "rows": [
-            {"spec": "hoigs", "PSNR": 31.5},
-            {"spec": "static", "PSNR": "not computed"},
-        ],
+        "rows": [{"spec": "hoigs", "PSNR": 31.5}, {"spec": "static", "PSNR": "not computed"}],
         "notes": ["a"],
     }
     assert said.err == "working\n" and Talk.tables is None

@@ -148,9 +148,7 @@ def turned(a: BodyPose, b: BodyPose) -> Tensor:
     return torch.rad2deg(apart.norm(dim=-1))
 
 
-def test_estimated_poses_of_test_frames_are_blended(
-    scene: tuple[SceneModel, Clip],
-) -> None:
+def test_estimated_poses_of_test_frames_are_blended(scene: tuple[SceneModel, Clip]) -> None:
     model, clip = scene
     estimated = replace(clip, provenance={POSES_ESTIMATED: True})
     for source, pose in ((clip, "given"), (estimated, "blended")):

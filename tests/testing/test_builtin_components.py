@@ -23,6 +23,28 @@ SMALL = {  # smaller, but the same code
     "density:mcmc": {"cap": 300},
     "density:budget": {"count": 300},
 }
+PLANES = {"channels": 4, "resolution": 6, "multires": [1, 2], "width": 12}
+TABLE = {"embedding": 5, "table": 8, "rows": 9, "coarse_rows": 3, "width": 12, "neighbours": 4}
+SE3 = {"width": 12, "depth": 3, "skip": 2}
+FREQUENCIES = {"position_frequencies": 3, "time_frequencies": 3}
+HEADS = ["means", "scales", "rotations", "opacity", "sh"]
+FIELDS = [  # in settings that change what they compute
+    ("deformation:hexplane-field", PLANES | {"time_resolution": 5, "depth": 2, "heads": HEADS}),
+    (
+        "deformation:hexplane-field",
+        PLANES | {"time_resolution": 9, "time_span": "half", "turning": "added"},
+    ),
+    ("deformation:embedded", TABLE | {"depth": 2, "heads": HEADS}),
+    ("deformation:embedded", TABLE | {"turning": "added", "table_smoothness": "last-row"}),
+    ("deformation:se3-field", SE3 | {"elastic_points": 9}),
+    ("deformation:se3-field", SE3 | {"ambient": 2, "ambient_depth": 2, "ambient_width": 8}),
+    (
+        "deformation:mlp",
+        FREQUENCIES
+        | {"width": 12, "depth": 4, "track": False, "zero_heads": False}
+        | {"space": "activated", "turning": "added"},
+    ),
+]
 # rasterizers are in tests/rasterizers/test_conformance.py; these need a user's file
 ELSEWHERE = {"body:smplx", "body:smpl", "body:smplh", "objective:tracks"}
 KEYS = [
@@ -45,6 +67,7 @@ def _imported_at_once() -> None:
         (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": True, "light": True}),
         (HUMAN, SMALL[HUMAN] | {"free_attributes": "all", "nonrigid": "shading", "light": True}),
         ("deformation:tracked-chs", {"light": True, "opacity": "constant"}),
+        *FIELDS,
     ],
 )
 def test_conforms(key, settings) -> None:

@@ -15,16 +15,7 @@ import pytest
 import reader_mutants
 
 from hoigs.plugins.readers.clip import ClipFolderReader
-from hoigs.testing import (
-    body,
-    decoder,
-    density,
-    exporter,
-    features,
-    interaction,
-    objective,
-    reader,
-)
+from hoigs.testing import body, decoder, density, exporter, features, interaction, objective, reader
 from hoigs.testing.checks import run_checks
 from hoigs.testing.material import TinyBody
 

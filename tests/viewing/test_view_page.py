@@ -83,10 +83,10 @@ def test_the_page_plays_offline_and_draws_what_we_draw(
         )  # fmt: skip
         drawn_after(page, before)
         seen[frame] = opened.pixels()
-        from hoigs.core.values.between import camera_between
-        from hoigs.viewing.viewer.panes import covered, fitted
+        from hoigs.core.values.between import camera_between, in_shape
+        from hoigs.viewing.viewer.panes import covered
 
-        view = fitted(camera_between(loaded.clip, frame), (640, 480))
+        view = in_shape(camera_between(loaded.clip, frame), 640, 480)
         ours = drawing.draw(frame, view, Look(entities=everything)).image.astype(np.float64)
         inside = covered(loaded.clip, view)
         assert psnr(seen[frame][inside], ours[inside]) > 30, frame

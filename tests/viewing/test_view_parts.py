@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 import torch
 
-from hoigs.core.values.between import camera_between
+from hoigs.core.values.between import camera_between, in_shape
 from hoigs.core.values.camera import Camera
 from hoigs.runs.loaded_run import LoadedRun
 from hoigs.viewing.viewer import eyes
 from hoigs.viewing.viewer.clip_drawing import ClipDrawing
 from hoigs.viewing.viewer.controls import Clock
 from hoigs.viewing.viewer.eyes import Eye
-from hoigs.viewing.viewer.panes import fitted, inner_rectangle, joined
+from hoigs.viewing.viewer.panes import inner_rectangle, joined
 from hoigs.viewing.viewer.run_drawing import FAR, MODES, Look, Resolution, RunDrawing
 from hoigs.viewing.viewer.takes import Path as TakenPath
 from hoigs.viewing.viewer.takes import turned_to
@@ -84,7 +84,7 @@ def test_a_camera_fitted_into_a_canvas_shows_the_same_in_the_middle() -> None:
     )
     points = torch.tensor(((0.1, 0.2, 0.3), (-0.5, 0.1, 0.0)))
     left, top, width, _ = inner_rectangle((100, 50), (300, 300))
-    wide = fitted(camera, (300, 300))
+    wide = in_shape(camera, 300, 300)
     assert (left, top, width) == (0, 75, 300)
     expected = camera.project(points)[0] * 3 + torch.tensor((0.0, 75.0))
     assert torch.allclose(wide.project(points)[0], expected, atol=1e-3)
@@ -135,7 +135,7 @@ def test_every_mode_draws_another_picture(drawing: RunDrawing) -> None:
         assert picture.shape == (camera.height, camera.width, 3) and picture.std() > 1
         for other in pictures[:i]:
             assert np.abs(picture.astype(int) - other).mean() > 1
-    wide = fitted(camera, (2 * camera.width, camera.height))
+    wide = in_shape(camera, 2 * camera.width, camera.height)
     error = drawing.draw(3.0, wide, Look("error to the video", everything)).image
     assert error[:, : camera.width // 2].max() == 0 < error.max()  # the video does not reach there
     colour = pictures[MODES.index("colour")]

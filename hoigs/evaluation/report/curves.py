@@ -40,9 +40,8 @@ def loss_curve(records: Sequence[dict[str, Any]]) -> str:
     """Total loss and its largest terms, logarithmic."""
     steps = [r["step"] for r in records]
     last = records[-1].get("losses", {})
-    names = sorted(
-        (n for n in last if not n.startswith("regularizer/")), key=lambda n: -abs(last[n])
-    )
+    names = [name for name in last if not name.startswith("regularizer/")]
+    names.sort(key=lambda name: -abs(last[name]))
 
     def paint(axes: Axes) -> None:
         for name, hue in zip(names[:SHOWN_TERMS], HUES):

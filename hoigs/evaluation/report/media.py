@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -43,8 +44,7 @@ def draw(
 
 def picture(color: Float[Tensor, "H W C"]) -> UInt8[np.ndarray, "H W C"]:
     """Values clamped to [0, 1] and rounded to 8 bits."""
-    array: np.ndarray = (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    return array
+    return (color.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def cut_out(output: RenderOutput) -> UInt8[np.ndarray, "H W 4"]:
@@ -96,8 +96,6 @@ def _hex(values: Float[Tensor, " N"], name: str) -> list[str]:
 
 def false_color(values: Float[Tensor, "H W"], name: str) -> UInt8[np.ndarray, "H W 3"]:
     """Values in [0, 1], clamped, by one of matplotlib's maps."""
-    import matplotlib
-
     mapped = matplotlib.colormaps[name](values.clamp(0, 1).cpu().numpy(), bytes=True)
     return np.ascontiguousarray(mapped[..., :3])
 
@@ -105,10 +103,7 @@ def false_color(values: Float[Tensor, "H W"], name: str) -> UInt8[np.ndarray, "H
 Item = TypeVar("Item")
 PLAYBACK_FRAMES, ORBIT_FRAMES, COMPARED, HELD_OUT = 48, 36, 6, 3
 PANEL_WIDTH, COMPARE_WIDTH = 400, 720
-SEQUENCE, SEQUENCE_WIDTH = (
-    24,
-    360,
-)  # frames of the player, and the width of each of its three panels
+SEQUENCE, SEQUENCE_WIDTH = 24, 360  # frames of the player, and the width of its three panels
 PLAYBACK_BYTES, ORBIT_BYTES = 2_000_000, 1_200_000
 
 
@@ -175,15 +170,11 @@ def frozen_orbit(
 def cutouts(model: SceneModel, clip: Clip, position: int) -> list[Cutout]:
     """Every entity rendered alone at one moment."""
     moment, camera = clip.moments[position], clip.cameras[position]
-    return [
-        Cutout(
-            name,
-            model.entity(name).kind,
-            len(model.entity(name)),
-            still(cut_out(draw(model, moment, camera, [name])), PANEL_WIDTH, 80),
-        )
-        for name in model.entities
-    ]
+    made = []
+    for name in model.entities:
+        entity, drawn = model.entity(name), cut_out(draw(model, moment, camera, [name]))
+        made.append(Cutout(name, entity.kind, len(entity), still(drawn, PANEL_WIDTH, 80)))
+    return made
 
 
 def comparisons(model: SceneModel, clip: Clip, evaluation: Evaluation) -> list[Comparison]:
@@ -221,9 +212,8 @@ def _compare(model: SceneModel, frame: Frame, scored: FrameScores, name: str) ->
 
 def scored_sequence(model: SceneModel, clip: Clip, evaluation: Evaluation) -> Moving:
     """The scored frames of the video in order: video | render | error."""
-    frames = [
-        f for view in evaluation.views if view.name != "held-out cameras" for f in view.frames
-    ]
+    views = [view for view in evaluation.views if view.name != "held-out cameras"]
+    frames = [frame for view in views for frame in view.frames]
     pictures, labels = [], []
     for scored in evenly(sorted(frames, key=lambda f: f.index), SEQUENCE):
         frame = clip[scored.position]

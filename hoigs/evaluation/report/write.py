@@ -135,49 +135,32 @@ def _compared(model: SceneModel, clip: Clip, evaluation: Evaluation) -> str:
     sequence = media.scored_sequence(model, clip, evaluation)
     error = sections.color_bar("Absolute error", error_colors(), "0", f"{ERROR_FULL:g}")
     unseen = all(view.protocol.split == "test" for view in evaluation.views)
-    return _section(
+    text = _section(
         "Frames outside training" if unseen else "Frame by frame",
         ("None of these images took part in training. " if unseen else "")
         + "Drag the line between them; choose a frame below.",
         sections.comparer(comparisons, error),
-    ) + (
-        _section(
-            "In a row",
-            "The frames that were scored, in their order.",
-            sections.player(sequence, ("The video", "The reconstruction", error)),
-        )
-        if sequence.pictures  # a clip may be scored by held-out cameras alone
-        else ""
     )
+    if not sequence.pictures:  # a clip may be scored by held-out cameras alone
+        return text
+    player = sections.player(sequence, ("The video", "The reconstruction", error))
+    return text + _section("In a row", "The frames that were scored, in their order.", player)
 
 
 def _further(folder: Path) -> str:
     run = in_shell(folder)
     there = [path.relative_to(folder).as_posix() for kind in BESIDE for path in folder.glob(kind)]
-    return _section(
-        "Look further",
-        "",
-        (sections.files(sorted(there)) if there else "")
-        + sections.commands(
-            (
-                (f"hoigs view {run}", "from any side, in the browser"),
-                (f"hoigs view {run} --html run.html", "the same as one file to send"),
-                (
-                    f"hoigs render {run} --path bullet-time",
-                    "a film: the moment stands still, the camera moves",
-                ),
-                (f"hoigs render {run} --compare", "a film beside the video"),
-                (
-                    f"hoigs export {run} --format ply --out scene.ply",
-                    "one moment for viewers of Gaussians",
-                ),
-                (
-                    f"hoigs export {run} --format usd --out scene.usd",
-                    "all moments for Blender, Houdini and others",
-                ),
-            )
-        ),
-    )
+    links = sections.files(sorted(there)) if there else ""
+    commands = {
+        "view RUN": "from any side, in the browser",
+        "view RUN --html run.html": "the same as one file to send",
+        "render RUN --path bullet-time": "a film: the moment stands still, the camera moves",
+        "render RUN --compare": "a film beside the video",
+        "export RUN --format ply --out scene.ply": "one moment for viewers of Gaussians",
+        "export RUN --format usd --out scene.usd": "all moments for Blender, Houdini and others",
+    }
+    lines = [(f"hoigs {words.replace('RUN', run)}", what) for words, what in commands.items()]
+    return _section("Look further", "", links + sections.commands(lines))
 
 
 def _space(model: SceneModel, clip: Clip) -> str:
@@ -247,11 +230,8 @@ def _origin(folder: Path) -> str:
         parts.append(sections.provenance(RunFolder(folder).read_provenance(), without_home))
     spec = folder / "spec.yaml"
     if spec.is_file():
-        parts.append(
-            sections.document(
-                "spec.yaml, resolved: it makes this run again", without_home(spec.read_text())
-            )
-        )
+        title = "spec.yaml, resolved: it makes this run again"
+        parts.append(sections.document(title, without_home(spec.read_text())))
     absent = [file.name for file in (provenance, spec) if not file.is_file()]
     return _section("Provenance", f"Absent: {', '.join(absent)}." if absent else "",
                     "".join(parts))  # fmt: skip

@@ -167,8 +167,7 @@ def image_losses(
     Differentiable once, in the render. Two runs agree bit for bit. On a CPU the kernels run as
     scalar code, which serves tests.
     """
-    losses: Tensor = _ImageLosses.apply(render.contiguous(), tuple(targets))
-    return losses
+    return _ImageLosses.apply(render.contiguous(), tuple(targets))
 
 
 class _ImageLosses(torch.autograd.Function):

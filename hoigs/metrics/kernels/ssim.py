@@ -51,8 +51,7 @@ def mean_ssim(
     _check(image, target)
     kernels = _kernels(image.device.type)
     tracked = torch.is_grad_enabled() and image.requires_grad
-    value: Tensor = _Mean.apply(_planes(image, kernels), _planes(target, kernels), kernels, tracked)
-    return value
+    return _Mean.apply(_planes(image, kernels), _planes(target, kernels), kernels, tracked)
 
 
 def ssim_map(

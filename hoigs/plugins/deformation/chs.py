@@ -121,7 +121,6 @@ class CubicHermite(Keyframed):
         return moved
 
     def means_at(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
-        del canonical
         return self._means(moment.time)
 
     def _means(self, time: Time, *, derivative: bool = False) -> Float[Tensor, "N 3"]:
@@ -141,7 +140,6 @@ class CubicHermite(Keyframed):
 
     def velocity(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """tau(t): exact derivative of the spline, metres per keyframe interval."""
-        del canonical
         return self._means(moment.time, derivative=True)
 
     @torch.no_grad()

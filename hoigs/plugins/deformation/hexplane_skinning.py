@@ -328,8 +328,7 @@ class HexPlaneSkinning(SurfaceBody):
 
     def _predicted(self, points: Float[Tensor, "N 3"]) -> CanonicalAttributes:
         """psi_h(f) at points of the zero pose, metres."""
-        attributes: CanonicalAttributes = self.head(self.planes(self._plane_points(points)))
-        return attributes
+        return self.head(self.planes(self._plane_points(points)))
 
     def _plane_points(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Points of the zero pose, metres, in the coordinates of the planes: [-1, 1]."""
@@ -351,7 +350,6 @@ class HexPlaneSkinning(SurfaceBody):
         if attributes.offsets.requires_grad:
 
             def forget(gradient: Tensor) -> None:
-                del gradient
                 self._last, self._changes = None, {}
 
             attributes.offsets.register_hook(forget)
@@ -388,7 +386,6 @@ class HexPlaneSkinning(SurfaceBody):
         Gaussians there are. Features have gradients in the planes but not in the pose: the person's
         motion is learned from images, not from where its features are read.
         """
-        del canonical
         with torch.no_grad():
             body = self.posed_body(moment)
             points = body.vertices.index_select(0, self.field_vertices)

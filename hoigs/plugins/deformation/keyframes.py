@@ -283,10 +283,7 @@ class Keyframed(Resizing, DeformationModel):
         if self.irradiance is None:
             return moved
         normals = self.normals / self.normals.norm(dim=-1, keepdim=True)  # they start with length 1
-        lit: Gaussians = self.irradiance(
-            moved, turned_normals(normals, canonical.quats, moved.quats)
-        )
-        return lit
+        return self.irradiance(moved, turned_normals(normals, canonical.quats, moved.quats))
 
     def refitted(
         self, samples: Float[Tensor, "S D"], fit: Sequence[float], times: Sequence[float]

@@ -114,13 +114,10 @@ class MlpDeformation(DeformationModel):
         """What is added at `time` to Gaussians whose canonical means are `means`, metres."""
         instant = means.new_full((1, 1), clamped_time(time))
         code = positional_encoding(instant, self.config.time_frequencies).expand(len(means), -1)
-        entry = torch.cat(
-            (positional_encoding(means, self.config.position_frequencies), code), dim=-1
-        )
-        means_delta, quats_delta, scales_delta = self.heads(self.trunk(entry)).split(
-            (3, 4, 3), dim=-1
-        )
-        return GaussianDelta(means=means_delta, quats=quats_delta, log_scales=scales_delta)
+        place = positional_encoding(means, self.config.position_frequencies)
+        outputs = self.heads(self.trunk(torch.cat((place, code), dim=-1)))
+        moved, turned, scaled = outputs.split((3, 4, 3), dim=-1)
+        return GaussianDelta(means=moved, quats=turned, log_scales=scaled)
 
     def noise_now(self) -> float:
         """Standard deviation of the noise on time at this point of the run, in clip lengths."""

@@ -58,8 +58,7 @@ class NonRigid(nn.Module, ABC):
         Args:
             points: points in the zero pose, in [-1, 1] within the planes. time: in [0, 1].
         """
-        residual: Tensor = self.layers(self.planes(points, time))
-        return residual
+        return self.layers(self.planes(points, time))
 
     @abstractmethod
     def change(

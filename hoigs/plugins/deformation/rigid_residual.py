@@ -63,7 +63,6 @@ class RigidResidual(RigidSpline):
         return canonical.means + offsets, canonical.quats
 
     def shape_velocity(self, canonical: Gaussians, time: Time) -> Float[Tensor, "N 3"]:
-        del canonical
         own = self.residual_knots.catmull_rom(self.offsets, time, derivative=True)
         return own * (self.knots.reference / self.residual_knots.reference)
 

@@ -216,12 +216,10 @@ class RigidSpline(Keyframed):
         self, canonical: Gaussians, time: Time
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 4"]]:
         """Centres and rotations in the object's frame; here they stay."""
-        del time
         return canonical.means, canonical.quats
 
     def shape_velocity(self, canonical: Gaussians, time: Time) -> Float[Tensor, "N 3"] | None:
         """Derivative of `shape`'s centres per keyframe interval; None while they stay."""
-        del canonical, time
         return None
 
     def forward(

@@ -69,6 +69,5 @@ class SharedHarmonics(DeformationModel):
     def forward(
         self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
-        del moment
         means = displaced(canonical.means, residual)
         return canonical.replace(means=means, sh=self.harmonics())

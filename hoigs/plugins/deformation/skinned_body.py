@@ -334,7 +334,6 @@ class SkinnedBody(DeformationModel):
 
     def scale_center(self, pelvis: Float[Tensor, " 3"], moment: Moment) -> Float[Tensor, " 3"]:
         """The fixed point of alpha in the world."""
-        del moment
         return pelvis
 
     @torch.no_grad()

@@ -18,6 +18,5 @@ class Static(DeformationModel):
     def forward(
         self, canonical: Gaussians, moment: Moment, residual: Residual | None = None
     ) -> Gaussians:
-        del moment
         means = displaced(canonical.means, residual)
         return canonical if means is canonical.means else canonical.replace(means=means)

@@ -160,17 +160,11 @@ class SurfaceBody(SkinnedBody):
         if residual is not None and residual.means is not None:
             means = means + residual.means
         posed = replace(
-            canonical,
-            means=means,
-            quats=quats,
-            log_scales=canonical.log_scales + self.log_alpha,
+            canonical, means=means, quats=quats, log_scales=canonical.log_scales + self.log_alpha
         )
         if self.irradiance is None:
             return posed
-        lit: Gaussians = self.irradiance(
-            posed, turned_normals(self.normals, canonical.quats, quats)
-        )
-        return lit
+        return self.irradiance(posed, turned_normals(self.normals, canonical.quats, quats))
 
     def surface_points(self) -> Float[Tensor, "N 3"]:
         """Where each canonical point lies on the template in its zero pose, metres."""

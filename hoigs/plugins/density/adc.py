@@ -124,7 +124,6 @@ class AdaptiveDensity(DensityControl):
         self, statistics: DensityStatistics, large: Bool[Tensor, " N"]
     ) -> Float[Tensor, " N"]:
         """The gradient over its threshold; Gaussians of 1 and more are cloned or split."""
-        del large
         return statistics.mean_gradient / self.config.threshold
 
     def _change(

@@ -79,8 +79,7 @@ def shared_among(gaussians: Gaussians, copies: Int[Tensor, " M"], min_opacity: f
     shrink = relocation_shrink(gaussians.opacities[rows], copies[rows])
     log_scales[rows] += shrink.log()[:, None]
     return gaussians.replace(
-        opacity_logits=torch.where(several, logits, gaussians.opacity_logits),
-        log_scales=log_scales,
+        opacity_logits=torch.where(several, logits, gaussians.opacity_logits), log_scales=log_scales
     )
 
 
@@ -146,11 +145,7 @@ class McmcDensity(DensityControl):
     cap: int
 
     def __init__(
-        self,
-        config: McmcDensityConfig | None = None,
-        *,
-        seed: int = 0,
-        clip: Clip | None = None,
+        self, config: McmcDensityConfig | None = None, *, seed: int = 0, clip: Clip | None = None
     ) -> None:
         self.config = config = config or McmcDensityConfig()
         self.window = Window(config.start, config.stop, config.interval)
@@ -175,7 +170,6 @@ class McmcDensity(DensityControl):
         total_steps: int,
         extent: float,
     ) -> Refinement | None:
-        del current, statistics, extent
         if not self.window.refines(step, total_steps) or len(canonical) == 0:
             return None
         generator = step_generator(self.seed, step, canonical.means.device)
@@ -239,7 +233,6 @@ class McmcDensity(DensityControl):
         self, canonical: Gaussians, *, step: int, total_steps: int, rate: float
     ) -> Float[Tensor, "N 3"] | None:
         """Langevin noise (Eq. 8): Sigma eta, gated by opacity, until the end of the run."""
-        del total_steps
         size = rate * self.config.noise
         if size == 0 or len(canonical) == 0:
             return None

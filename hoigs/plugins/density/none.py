@@ -21,5 +21,4 @@ class NoDensity(DensityControl):
         total_steps: int,
         extent: float,
     ) -> Refinement | None:
-        del canonical, current, statistics, step, total_steps, extent
         return None

@@ -103,9 +103,7 @@ class Carried:
 def still(name: str, gaussians: Gaussians) -> Carried:
     """An entity that does not move."""
     none = torch.zeros(len(gaussians), INFLUENCES)
-    return Carried(
-        name, gaussians, none.long(), none, {}, torch.zeros(1, 0), 0.0, 0.0, still=True
-    )  # fmt: skip
+    return Carried(name, gaussians, none.long(), none, {}, torch.zeros(1, 0), 0.0, 0.0, still=True)
 
 
 def same(a: Gaussians, b: Gaussians) -> bool:
@@ -215,7 +213,10 @@ def carried(
     middle = {k: v.mean(0) for k, v in values.items()}
     weights = _visible(middle)
     coefficients, modes = _modes({k: v - middle[k] for k, v in values.items()}, weights, most)
-    off = {k: values[k] - middle[k] - _sum(coefficients, modes[k]) for k in ("means", "color")}
+    off = {
+        k: values[k] - middle[k] - torch.einsum("fk,knd->fnd", coefficients, modes[k])
+        for k in ("means", "color")
+    }
     canonical = Gaussians(
         middle["means"], normalize_quats(middle["quats"]), middle["log_scales"],
         middle["opacity"][:, 0].clamp(1e-6, 1 - 1e-6).logit(),
@@ -225,10 +226,6 @@ def carried(
     return Carried(
         name, canonical, *bound, modes, coefficients, 1e3 * left["means"], left["color"]
     )  # fmt: skip
-
-
-def _sum(coefficients: Float[Tensor, "F K"], modes: Float[Tensor, "K N d"]) -> Tensor:
-    return torch.einsum("fk,knd->fnd", coefficients, modes)
 
 
 def _visible(middle: dict[str, Tensor]) -> dict[str, Float[Tensor, "N 1"]]:
@@ -254,9 +251,8 @@ def _modes(
         return torch.zeros(count, 0), {k: v[:0] for k, v in changes.items()}
     rows = torch.cat([(v * weights[k]).flatten(1) for k, v in moving.items()], 1).double()
     power, axes = torch.linalg.eigh(rows @ rows.mT)
-    left = (
-        power.clamp_min(0).cumsum(0) / (count * weights["color"].double().square().sum())
-    ).sqrt()
+    seen = count * weights["color"].double().square().sum()
+    left = (power.clamp_min(0).cumsum(0) / seen).sqrt()
     kept = min(most, count - 1, int((left > VISIBLE).sum()))
     axes = axes.flip(-1)[:, :kept].float()
     # signs of eigenvectors are free: the largest entry is positive, on every machine
@@ -310,9 +306,8 @@ def _entity(
         bound = body_weights(request, body, torch.stack([g.means for g in frames]))
         return Entity(carried(name, frames, body_joints(body), bound, eyes, modes), body)
     rigid = object_motion(request, name)
-    rigid = replace(
-        rigid, rotations=move.turn @ rigid.rotations, translations=move.points(rigid.translations)
-    )
+    turns, places = move.turn @ rigid.rotations, move.points(rigid.translations)
+    rigid = replace(rigid, rotations=turns, translations=places)
     first = torch.zeros(len(frames[0]), INFLUENCES)
     bound = first.long(), torch.cat((first[:, :1] + 1, first[:, 1:]), 1)
     return Entity(carried(name, frames, rigid_joint(rigid), bound, eyes, modes), rigid)

@@ -58,7 +58,6 @@ class GaussForgeExporter(Exporter):
 
     def prepared(self, gaussians: Gaussians, clip: Clip) -> Gaussians:
         """What is packed; overridden where the format cannot hold all of it."""
-        del clip
         return gaussians
 
     def packed(self, gaussians: Gaussians) -> tuple[bytes, Gaussians]:
@@ -71,7 +70,6 @@ class GaussForgeExporter(Exporter):
 
         Overridden where the format has one; GaussForge does not set it.
         """
-        del antialiased
         return data
 
 
@@ -163,8 +161,7 @@ def converted(data: bytes, source: str, target: str) -> bytes:
     answer = gaussforge.GaussForge().convert(data, source, target)
     if "data" not in answer:
         raise HoigsError(f"GaussForge cannot write {target}: {answer.get('error', 'no reason')}")
-    made: bytes = answer["data"]
-    return made
+    return answer["data"]
 
 
 @torch.no_grad()

@@ -46,8 +46,8 @@ class Glb:
     an array.
     """
 
-    def __init__(self, generator: str = "hoigs") -> None:
-        self.document: dict[str, Any] = {"asset": {"version": "2.0", "generator": generator}}
+    def __init__(self) -> None:
+        self.document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "hoigs"}}
         self._data = bytearray()
 
     def add(self, kind: str, **entry: Any) -> int:
@@ -95,10 +95,8 @@ class Glb:
 
     def zeros(self, count: int) -> int:
         """The accessor of positions that are all zero, which takes no room."""
-        none = [0.0, 0.0, 0.0]
-        return self.add(
-            "accessors", componentType=5126, count=count, type="VEC3", min=none, max=none
-        )
+        entry = {"componentType": COMPONENTS["float32"], "count": count, "type": "VEC3"}
+        return self.add("accessors", **entry, min=[0.0] * 3, max=[0.0] * 3)
 
     def whole(self) -> bytes:
         """The file."""

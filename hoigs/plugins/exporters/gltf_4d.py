@@ -23,14 +23,7 @@ from hoigs.core.config import ComponentConfig
 from hoigs.core.model.exporter import Exporter, ExportRequest
 from hoigs.core.reporting import Progress
 from hoigs.core.values.between import camera_between, frame_of
-from hoigs.plugins.exporters.carried import (
-    FLOORS,
-    Carried,
-    Entity,
-    collect,
-    quantised,
-    rigid_joint,
-)
+from hoigs.plugins.exporters.carried import FLOORS, Carried, Entity, collect, quantised, rigid_joint
 from hoigs.plugins.exporters.glb import (
     KERNEL,
     NAME,
@@ -44,12 +37,7 @@ from hoigs.plugins.exporters.glb import (
     linear_color,
     xyzw,
 )
-from hoigs.plugins.exporters.posed import (
-    AXES,
-    BodyMotion,
-    ObjectMotion,
-    world_move,
-)
+from hoigs.plugins.exporters.posed import AXES, BodyMotion, ObjectMotion, world_move
 
 EXTENSION = "HOIGS_gaussian_motion"
 FINE = 2e-4  # metres; steps of positions and sizes that are coarser are stored as float32

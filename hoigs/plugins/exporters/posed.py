@@ -181,25 +181,18 @@ def body_motion(request: ExportRequest, name: str) -> BodyMotion:
     rotations = torch.stack([body.joint_rotations(pose) for pose in poses])
     rest = body.shaped(betas)[1]
     track = request.clip.bodies.get(name)
+    model, gender = (track.model, track.gender) if track else (type(body).__name__, None)
     deformation = request.scene.entity(name).deformation
-    scale, pelvis = 1.0, None
+    scale = 1.0
     if isinstance(deformation, ProvidesSkeleton):
         scale = float(deformation.arm_length().cpu() / body.arm_length(betas))
         scale = 1.0 if abs(scale - 1) < 1e-4 else scale
         pelvis = torch.stack([deformation.anchors(m)[0].cpu() for m in request.moments])
-    if pelvis is None:
+    else:
         pelvis = torch.stack([body.shaped(p.betas)[1][0] + p.transl for p in poses])
     return BodyMotion(
-        name,
-        track.model if track else type(body).__name__,
-        track.gender if track else None,
-        body,
-        betas,
-        rotations,
-        pelvis - rest[0],
-        scale,
-        rest,
-    )
+        name, model, gender, body, betas, rotations, pelvis - rest[0], scale, rest
+    )  # fmt: skip
 
 
 def _pose(request: ExportRequest, name: str, moment: Moment) -> BodyPose:

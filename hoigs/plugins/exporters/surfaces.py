@@ -57,8 +57,7 @@ class Surface:
         corner = np.zeros((len(self.vertices), 2))
         corner[self.faces.reshape(-1)] = self.uv.reshape(-1, 2)
         column, row = np.clip((corner * (side, -side) + (0, side)).astype(int), 0, side - 1).T
-        colors: np.ndarray = self.texture[row, column] / 255.0
-        return colors
+        return self.texture[row, column] / 255.0
 
     def png(self) -> bytes:
         """The texture as a file."""
@@ -307,8 +306,7 @@ def _two_by_two(count: int, grid: int, side: int) -> np.ndarray:
     first = np.array(((1, 1), (cell - 3, 1), (1, cell - 3)))
     corners = np.where((number % 2 == 0)[:, None, None], first, cell - first)
     square = np.stack((number // 2 % grid, number // 2 // grid), -1)
-    placed: np.ndarray = (square[:, None] * cell + corners) / side
-    return placed
+    return (square[:, None] * cell + corners) / side
 
 
 def _samples(corners: np.ndarray, uv: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -324,8 +322,7 @@ def _samples(corners: np.ndarray, uv: np.ndarray, side: int) -> tuple[np.ndarray
         at = np.einsum("sc,tcd->tsd", shares, uv[some]).reshape(-1, 2)
         column, row = np.clip((at * (side, -side) + (0, side)).astype(int), 0, side - 1).T
         texels, first = np.unique(row * side + column, return_index=True)
+        places = np.einsum("sc,tcd->tsd", shares, corners[some]).reshape(-1, 3)
         found["texels"].append(texels)
-        found["places"].append(
-            np.einsum("sc,tcd->tsd", shares, corners[some]).reshape(-1, 3)[first]
-        )
+        found["places"].append(places[first])
     return np.concatenate(found["texels"]), np.concatenate(found["places"])

@@ -157,9 +157,8 @@ def _add_splats(stage: Usd.Stage, request: ExportRequest, move: Move, progress: 
         _set(prim.CreatePositionsAttr(), [_vectors(g.means) for g in seen])
         _set(prim.CreateOrientationsAttr(), [_quats(g.quats) for g in seen])
         _set(prim.CreateScalesAttr(), [_vectors(g.scales) for g in seen])
-        _set(
-            prim.CreateOpacitiesAttr(), [Vt.FloatArray.FromNumpy(g.opacities.numpy()) for g in seen]
-        )
+        opacities = [Vt.FloatArray.FromNumpy(g.opacities.numpy()) for g in seen]
+        _set(prim.CreateOpacitiesAttr(), opacities)
         prim.CreateRadianceSphericalHarmonicsDegreeAttr(seen[0].sh_degree)
         colors = prim.CreateRadianceSphericalHarmonicsCoefficientsAttr()
         _set(colors, [_vectors(g.sh) for g in seen])
@@ -199,9 +198,8 @@ def _add_person(
     _set(animation.CreateRotationsAttr(), [_quats(q) for q in turns])
     sizes = Vt.Vec3hArray([Gf.Vec3h(motion.scale if j == 0 else 1.0) for j in range(len(parents))])
     animation.CreateScalesAttr(sizes)
-    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
-        [animation.GetPath()]
-    )
+    source = UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel()
+    source.SetTargets([animation.GetPath()])
     _add_skin(_add_mesh(stage, f"{path}/mesh", surface, picture), motion, skeleton)
     UsdSkel.BindingAPI.Apply(root.GetPrim())
     span = [motion.vertices(i) for i in range(len(motion))]

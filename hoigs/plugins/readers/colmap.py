@@ -264,18 +264,9 @@ class ColmapReader(ClipReader):
         images = [files[stem] for stem in stems]
         lenses = [lens_for(view.lens, path) for view, path in zip(model.views, images)]
         cameras = [lens.camera(v.world_to_camera) for lens, v in zip(lenses, model.views)]
-        store = LazyFrames(
-            folder,
-            PixelFiles(
-                images,
-                masks={
-                    n: MaskFiles([folder / "masks" / n / f"{s}.png" for s in stems]) for n in masks
-                },
-            ),
-            cameras,
-            lenses=lenses,
-            cache_mb=self.config.cache_mb,
-        )
+        paths = {n: [folder / "masks" / n / f"{s}.png" for s in stems] for n in masks}
+        pixels = PixelFiles(images, masks={n: MaskFiles(paths[n]) for n in masks})
+        store = LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb)
         points, colors, origin = self._points(model, store, cameras, tuple(masks))
         order, count = _instants(files)
         at_once = "" if count == len(files) else f"; {len(files)} images of {count} instants"

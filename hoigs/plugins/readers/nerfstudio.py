@@ -65,12 +65,8 @@ class Intrinsics(BaseModel):
     p2: FiniteFloat | None = None
 
 
-def _slashes(path: str) -> str:
-    return path.replace("\\", "/")
-
-
 # a path of the file, which Windows writes with backslashes
-DataPath = Annotated[str, AfterValidator(_slashes)]
+DataPath = Annotated[str, AfterValidator(lambda path: path.replace("\\", "/"))]
 
 
 class TransformFrame(Intrinsics):
@@ -199,19 +195,14 @@ class NerfstudioReader(ClipReader):
         depths = [folder / f.depth_file_path if f.depth_file_path else None for f in frames]
         masks = [folder / f.mask_path if f.mask_path else None for f in frames]
         points, colors, origin = self._points(folder, file, cameras)
+        pixels = PixelFiles(
+            images,
+            ignored=MaskFiles(masks, dark) if any(masks) else None,
+            depth=DepthFiles(depths, self.config.depth_unit) if any(depths) else None,
+        )
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                PixelFiles(
-                    images,
-                    ignored=MaskFiles(masks, dark) if any(masks) else None,
-                    depth=DepthFiles(depths, self.config.depth_unit) if any(depths) else None,
-                ),
-                cameras,
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb),
             cameras=cameras,
             moments=_moments(frames, split["train"]),
             points=points,

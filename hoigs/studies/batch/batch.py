@@ -18,13 +18,7 @@ from hoigs.core.system.folder_lock import FolderLock
 from hoigs.studies.batch.folder import BATCH, BatchFolder, Stage, State, stages_of
 from hoigs.studies.batch.manifest import Row, each_row
 from hoigs.studies.batch.summary import write_summary
-from hoigs.studies.execution.local import (
-    LOST_RETRIES,
-    Executor,
-    Needs,
-    Process,
-    why_failed,
-)
+from hoigs.studies.execution.local import LOST_RETRIES, Executor, Needs, Process, why_failed
 from hoigs.studies.execution.queue import TAKEN_POLL_S, Queue, TakenError, hold
 from hoigs.studies.options import BatchOptions, WorkOptions
 

@@ -185,9 +185,8 @@ def stages_of(row: Row, folder: Path) -> list[Stage]:
         stages.append(Stage("prepare", prepare, clip, work, again=(*prepare, "--overwrite")))
     named = row.clip or str(clip)
     train = ("train", named, *row.training(run).words(), *(["--auto"] if row.auto else []))
-    stages.append(
-        Stage("train", train, run, run, again=(*train, "--overwrite"), resume=(*train, "--resume"))
-    )
+    again, resume = (*train, "--overwrite"), (*train, "--resume")
+    stages.append(Stage("train", train, run, run, again=again, resume=resume))
     evaluate = ("eval", str(run), *EvaluateOptions(device=row.device).words())
     stages.append(Stage("eval", evaluate, run / "evaluation.json", run))
     for format in row.export:

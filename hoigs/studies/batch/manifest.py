@@ -9,14 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self, TextIO
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.spec.loader import MAX_BYTES, load_yaml
@@ -205,11 +198,8 @@ Read = Iterable[tuple[dict[str, Any], dict[str, str]]]  # values, and where each
 
 def _yaml(file: TextIO, path: Path) -> Read:
     document = load_yaml(file.read(MAX_BYTES + 1), str(path))
-    _known(
-        document.data,
-        ("rows", "defaults"),
-        {k: document.where((k,), key=True) for k in document.data},
-    )
+    places = {k: document.where((k,), key=True) for k in document.data}
+    _known(document.data, ("rows", "defaults"), places)
     shared, rows = document.data.get("defaults") or {}, document.data.get("rows")
     if not isinstance(shared, dict):
         raise ManifestError(
@@ -296,11 +286,6 @@ def _names_in(folder: Path) -> list[str]:
 
 
 def _name_of(source: str) -> str:
-    name = (
-        Path(source).stem
-        if not source.startswith("builtin:")
-        else source.split(":")[1].partition("?")[0]
-    )
-    return "".join(c if c.isascii() and (c.isalnum() or c in "_-.") else "-" for c in name).lstrip(
-        ".-"
-    )[:80]
+    builtin = source.startswith("builtin:")
+    name = source.split(":")[1].partition("?")[0] if builtin else Path(source).stem
+    return re.sub(r"[^A-Za-z0-9_.-]", "-", name).lstrip(".-")[:80]

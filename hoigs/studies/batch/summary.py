@@ -126,8 +126,8 @@ def _score_cell(value: float | str) -> str:
 
 def _thumbnail(row: Row, folder: Path) -> str:
     """The middle frame of the row's clip as an image in the page; empty before it is prepared."""
-    clip = folder / "clip" if row.video else _clip_folder(row.clip)
-    images = sorted((clip / "images").glob("*")) if clip else []
+    clip = folder / "clip" if row.video else Path(row.clip)  # a built-in one is in a cache
+    images = sorted((clip / "images").glob("*"))
     if not images:
         return ""
     from PIL import Image
@@ -142,8 +142,3 @@ def _thumbnail(row: Row, folder: Path) -> str:
     small.save(stream, "JPEG", quality=85)
     data = base64.b64encode(stream.getvalue()).decode()
     return f'<img alt="a frame of {html.escape(row.name)}" src="data:image/jpeg;base64,{data}">'
-
-
-def _clip_folder(clip: str) -> Path | None:
-    """Of a CLIP argument; None for a built-in clip, whose folder is in a cache."""
-    return None if clip.startswith("builtin:") else Path(clip)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import NotComputed, Value, from_json, to_json
 from hoigs.studies.jobs.results import ALL_CLIPS, Spread
-from hoigs.studies.plots import MARKERS, PALETTE
+from hoigs.studies.plots import color_of, marker_of
 
 FORMAT, VERSION = "hoigs-chart", 1
 
@@ -122,6 +122,12 @@ class Point:
     def number(self, axis: Axis) -> float | None:
         value = self.values.get(axis.name)
         return value.mean if isinstance(value, Spread) else None
+
+    def known(self, axis: Axis) -> float:
+        """The number, which is there."""
+        value = self.number(axis)
+        assert value is not None, f"{self.spec} has no {axis.name}"
+        return value
 
     def spread(self, axis: Axis) -> float:
         """Standard deviation over seeds; 0 with a single seed."""
@@ -292,8 +298,8 @@ def series_of(points: Sequence[Point]) -> list[Series]:
         color = specs.index(spec)
         marker = setups.index((setup[0], setup[1])) if len(setups) > 1 else color
         ordered = tuple(sorted(own, key=lambda p: p.steps))
-        found.append(Series(name_of(own[0], points), PALETTE[color % len(PALETTE)],
-                            MARKERS[marker % len(MARKERS)], ordered))  # fmt: skip
+        name = name_of(own[0], points)
+        found.append(Series(name, color_of(color), marker_of(marker), ordered))
     return found
 
 
@@ -358,14 +364,14 @@ def front(points: Sequence[Point], axes: Sequence[Axis]) -> list[Point]:
     """Points that no other dominates, cheapest (by the first axis) first."""
     found = comparable(points, axes)
     kept = [p for p in found if not any(dominates(q, p, axes) for q in found if q is not p)]
-    return sorted(kept, key=lambda p: _known(p, axes[0]))
+    return sorted(kept, key=lambda p: p.known(axes[0]))
 
 
 def dominates(a: Point, b: Point, axes: Sequence[Axis]) -> bool:
     """No worse on all axes, better on one; False where either lacks a number."""
     if len(comparable((a, b), axes)) < 2:
         return False
-    pairs = [(axis, _known(a, axis), _known(b, axis)) for axis in axes]
+    pairs = [(axis, a.known(axis), b.known(axis)) for axis in axes]
     return all(axis.no_worse(x, y) for axis, x, y in pairs) and any(x != y for _, x, y in pairs)
 
 
@@ -382,16 +388,10 @@ def dominances(points: Sequence[Point], axes: Sequence[Axis]) -> list[Dominance]
 def _sure(a: Point, b: Point, axes: Sequence[Axis]) -> bool:
     if len(a.seeds) < 2 and len(b.seeds) < 2:
         return False
-    leads = [(axis, abs(_known(a, axis) - _known(b, axis))) for axis in axes]
+    leads = [(axis, abs(a.known(axis) - b.known(axis))) for axis in axes]
     return all(
         lead == 0 or lead > math.hypot(a.spread(axis), b.spread(axis)) for axis, lead in leads
     )
-
-
-def _known(point: Point, axis: Axis) -> float:
-    value = point.number(axis)
-    assert value is not None, f"{point.spec} has no {axis.name}"
-    return value
 
 
 def usable_axes(

@@ -96,18 +96,18 @@ def _panel(axes: Axes, series: Sequence[Series], cost: Axis, accuracy: Axis) -> 
     pair = (cost, accuracy)
     best = front([p for s in series for p in s.points], pair)
     if len(best) > 1:
-        axes.step([_at(p, cost) for p in best], [_at(p, accuracy) for p in best], where="post",
+        axes.step([p.known(cost) for p in best], [p.known(accuracy) for p in best], where="post",
                   label="Pareto front", color=FRONT, linewidth=1.2, linestyle="--",
                   zorder=1)  # fmt: skip
     steps = sorted({p.steps for s in series for p in s.points})
     for one in series:
         shown = comparable(one.points, pair)
-        axes.plot([_at(p, cost) for p in shown], [_at(p, accuracy) for p in shown],
+        axes.plot([p.known(cost) for p in shown], [p.known(accuracy) for p in shown],
                   color=one.color, linewidth=1.0, alpha=0.45, zorder=2)  # fmt: skip
         for point in shown:
             on_front = any(point is p for p in best)
             axes.errorbar(
-                _at(point, cost), _at(point, accuracy), xerr=point.spread(cost) or None,
+                point.known(cost), point.known(accuracy), xerr=point.spread(cost) or None,
                 yerr=point.spread(accuracy) or None, color=one.color, elinewidth=1.0,
                 marker=one.marker, markersize=MARKER * (steps.index(point.steps) + 3)
                 / (len(steps) + 2), markerfacecolor=one.color if on_front else "white",
@@ -116,12 +116,6 @@ def _panel(axes: Axes, series: Sequence[Series], cost: Axis, accuracy: Axis) -> 
         axes.plot([], [], one.marker, color=one.color, label=one.name, markersize=MARKER)
     axes.margins(0.12, 0.14)
     axes.tick_params(length=0)
-
-
-def _at(point: Point, axis: Axis) -> float:
-    value = point.number(axis)
-    assert value is not None
-    return value
 
 
 # Quality during training: PSNR of test frames over seconds and over steps, one line a series.

@@ -9,6 +9,8 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+import yaml
+
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.evaluation.geometry import GEOMETRY
 from hoigs.evaluation.scores import DIGITS, TITLES
@@ -143,11 +145,7 @@ class Published:
 
 @cache
 def _tables() -> dict[str, Any]:
-    import yaml
-
-    with Path(__file__).with_name("paper.yaml").open() as file:
-        tables: dict[str, Any] = yaml.safe_load(file)
-    return tables
+    return yaml.safe_load(Path(__file__).with_name("paper.yaml").read_text())
 
 
 def published(reference: str) -> Published:

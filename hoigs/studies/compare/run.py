@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from hoigs.core.registry.registry import default_registry
+from hoigs.core.spec.schema import Spec
 from hoigs.evaluation.protocol import NotComputed, Value
 from hoigs.studies.compare.data import ACCURACY, Cell, CurvePoint
 from hoigs.studies.execution.local import Executor
@@ -90,8 +92,6 @@ class _Place:
 
 
 def _planned(study: Comparison, place: _Place, folders: ClipFolders) -> Planned:
-    from hoigs.core.registry.registry import default_registry
-    from hoigs.core.spec.schema import Spec
     from hoigs.synthesis.named import is_named
 
     row, clip, rasterizer = place.row, place.clip, place.rasterizer

@@ -29,6 +29,7 @@ from hoigs.studies.compare.data import (
     usable_axes,
 )
 from hoigs.studies.jobs.results import ALL_CLIPS, Spread
+from hoigs.studies.plots import figure_files
 
 
 def by_clip(cells: Sequence[Cell]) -> dict[str, list[Point]]:
@@ -69,7 +70,6 @@ def write_chart(
 
 def _figures(clip: str, points: Sequence[Point], mix_machines: bool) -> dict[str, bytes]:
     from hoigs.studies.compare.panels import accuracy_chart, curve_chart
-    from hoigs.studies.plots import figure_files
 
     stem = f"chart-{slug(clip)}"
     drawn = accuracy_chart(points, f"{clip}: accuracy against cost", mix_machines=mix_machines)
@@ -96,9 +96,8 @@ def as_csv(cells: Sequence[Cell]) -> str:
     for cell in cells:
         base = vars(cell) | {"protocol": " ".join(cell.protocol)}
         for name in dict.fromkeys((*AXES, *cell.values)):
-            value = cell.values.get(
-                name, NotComputed(cell.missing or "this run has no such number")
-            )
+            unknown = NotComputed(cell.missing or "this run has no such number")
+            value = cell.values.get(name, unknown)
             absent = value.reason if isinstance(value, NotComputed) else ""
             number = "" if isinstance(value, NotComputed) else repr(value)
             writer.writerow(base | {"measure": name, "value": number, "not_computed": absent})

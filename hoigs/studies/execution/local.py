@@ -108,8 +108,7 @@ def make_executor(
         kind: Any = getattr(importlib.import_module(module), cls)
     except (ImportError, AttributeError) as error:
         raise HoigsError(f"--executor {name}: cannot be imported ({error})") from error
-    made: Executor = kind(slots=slots, threads=threads, address=address)
-    return made
+    return kind(slots=slots, threads=threads, address=address)
 
 
 def why_failed(log: Path, code: int) -> str:
@@ -153,7 +152,8 @@ class LocalExecutor:
             raise HoigsError(f"--address {address}: is for --executor ray; local has no cluster")
         self.slots = slots
         self._threads = threads or max(1, available_cpus() // slots)
-        self._memory = memory_gb if memory_gb is not None else _memory_gb()
+        installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+        self._memory = installed if memory_gb is None else memory_gb
         self._program = tuple(program)
         self._gpus = visible_gpus()
         self._next_gpu = 0
@@ -281,7 +281,3 @@ def visible_gpus() -> list[str]:
         return []
     listed = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
     return [str(i) for i in range(sum(x.startswith("GPU ") for x in listed.stdout.splitlines()))]
-
-
-def _memory_gb() -> float:
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9

@@ -53,11 +53,6 @@ class EnergyMeter:
         self._last = now
 
 
-def energy_meter(device: str) -> EnergyMeter | NotComputed:
-    """A meter of the GPU board for "cuda", else of the CPU packages."""
-    return nvml_meter(device) if device.startswith("cuda") else rapl_meter()
-
-
 def rapl_meter(root: Path = POWERCAP) -> EnergyMeter | NotComputed:
     """The counters of Linux for Intel and AMD CPUs, which only root can read on most systems."""
     if not root.is_dir():
@@ -238,7 +233,7 @@ def train_measured(session: Session, job: Job, runs_at_once: int = 1) -> None:
         parts.append(part)
         _write(path, record)
         start_peak(job.device)
-        meter = energy_meter(job.device)
+        meter = nvml_meter(job.device) if job.device.startswith("cuda") else rapl_meter()
         session.train(lambda _: meter.sample() if isinstance(meter, EnergyMeter) else None)
         joules = spent(meter)
         part["to_step"] = trainer.step
@@ -253,8 +248,7 @@ def train_measured(session: Session, job: Job, runs_at_once: int = 1) -> None:
 def read_study(folder: Path) -> dict[str, Any]:
     """`study.json` of a run; without parts where there is none."""
     path = folder / STUDY
-    found: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {"parts": []}
-    return found
+    return json.loads(path.read_text()) if path.is_file() else {"parts": []}
 
 
 def read_cost(folder: Path) -> Cost:
@@ -263,14 +257,10 @@ def read_cost(folder: Path) -> Cost:
     parts = study["parts"]
     if "train_s" not in study:
         return Cost(NotComputed(OLD), NotComputed(OLD), "", NotComputed(OLD), "", (), 1)
-    joules: Value
-    if len(parts) != 1 or "joules" not in parts[0]:
-        joules = NotComputed(INTERRUPTED)
-    else:
-        joules = from_json(parts[0]["joules"])
+    whole = len(parts) == 1 and "joules" in parts[0]
     return Cost(
         train_s=float(study["train_s"]),
-        joules=joules,
+        joules=from_json(parts[0]["joules"]) if whole else NotComputed(INTERRUPTED),
         source=parts[-1].get("source", "") if parts else "",
         memory_mb=_most(parts) if parts else NotComputed(NO_MEMORY),
         memory_source=parts[-1].get("memory_source", "") if parts else "",

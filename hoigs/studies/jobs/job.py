@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from hoigs.core.errors import CheckpointError, ClipError, SpecError
+from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.system.files import write_whole
 
@@ -88,8 +89,7 @@ class Job:
 
     def scores(self) -> dict[str, Any]:
         """The evaluation of a job that is done."""
-        found: dict[str, Any] = json.loads((self.folder / SCORES).read_text())
-        return found
+        return json.loads((self.folder / SCORES).read_text())
 
     def dump(self) -> str:
         return json.dumps(asdict(self))
@@ -119,8 +119,6 @@ def make_job(
     Raises:
         SpecError: the spec cannot be used, or a setting would be a second seed.
     """
-    from hoigs.core.registry.registry import default_registry
-
     if sum(setting.partition("=")[0].strip() == SEED for setting in settings) > 1:
         raise SpecError(
             f"{SEED}: the seeds of a study are 0, 1 … of --seeds; leave the setting out"

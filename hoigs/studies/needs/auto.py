@@ -86,11 +86,8 @@ def auto(
     if isinstance(options.spec, Spec):
         raise HoigsError("--auto reduces a spec by its name or file, not a Spec")
     name = str(options.spec or DEFAULT_SPEC)
-    if options.out is not None:
-        path = Path(options.out)
-    else:
-        path = Path("runs") / f"{clip_name(clip)}-{Path(name).stem}"
-        path = path.with_name(f"{path.name}-auto")
+    own = Path("runs") / f"{clip_name(clip)}-{Path(name).stem}-auto"
+    path = own if options.out is None else Path(options.out)
     answer, compact = needs_of(path), compact_of(path)
     device, plugins = pick_device(options.device), options.plugins
     trained = options.changed(spec=answer / "spec.yaml", out=path, device=device, evaluate=False)

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hoigs.core.values.clip import Clip, Frame, FrameStore
@@ -30,33 +30,21 @@ from hoigs.studies.needs.search_space import (
     gain,
     mean_gain,
 )
-from hoigs.studies.needs.trial import Trial, region_of
+from hoigs.studies.needs.trial import OverStore, Trial, region_of
 
 BEYOND = 0.05  # share of what is useless that is taken for a gain
 OBVIOUS = 3.0  # dB, half of the squared error: where all of that is gained, nothing is measured
 
 
-class DrawnStore(FrameStore):
+class DrawnStore(OverStore):
     """Another store, with other images in some frames."""
 
     def __init__(self, base: FrameStore, images: dict[int, UInt8[Tensor, "H W 3"]]) -> None:
-        self.base, self.images = base, images
-        self.root = base.root
+        super().__init__(base)
+        self.images = images
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
         return self.images[position] if position in self.images else self.base.image(position)
-
-    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
-        return self.base.mask(entity, position)
-
-    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
-        return self.base.depth(position)
-
-    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
-        return self.base.ignored(position)
-
-    def mask_known(self, entity: str, position: int) -> bool:
-        return self.base.mask_known(entity, position)
 
 
 @torch.no_grad()

@@ -139,7 +139,6 @@ def moved_provenance(
     folder = recorded_folder(run, provenance, registry)
     moved = {**clip, "path": target.relative(folder)}
     if clip.get("reader"):
-        moved["reader"] = recorded_reader(clip["reader"], run, folder, registry).record(
-            target.relative
-        )
+        reader = recorded_reader(clip["reader"], run, folder, registry)
+        moved["reader"] = reader.record(target.relative)
     return provenance | {"clip": moved}

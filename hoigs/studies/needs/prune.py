@@ -15,13 +15,7 @@ from torch import Tensor, nn
 from hoigs.core.interfaces.deformation import DeformationModel, HasKnots, has_knots
 from hoigs.core.interfaces.features import ReadsKnots
 from hoigs.core.maths.splines import uniform_times
-from hoigs.core.model.knot_refit import (
-    KnotTrial,
-    ScreenMotion,
-    as_movable,
-    remove_knots,
-    screen_of,
-)
+from hoigs.core.model.knot_refit import KnotTrial, ScreenMotion, as_movable, remove_knots, screen_of
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.parameters import on_host
 from hoigs.core.values.clip import Clip
@@ -309,9 +303,8 @@ class Pruning:
     def planes(self) -> None:
         """Remove time planes that are one, or that may be replaced by one."""
         for key, names in self.trained.blocks().items():
-            planes = [
-                p for n in names for p in time_planes(self.trained.model.entity(n).deformation)
-            ]
+            models = [self.trained.model.entity(name).deformation for name in names]
+            planes = [plane for model in models for plane in time_planes(model)]
             deformation = self.trained.spec.model[key].deformation
             if not planes or "time_resolution" not in deformation.settings:
                 continue
@@ -432,9 +425,8 @@ class Pruning:
             why += f" ({unseen:,} of these are in no training image)" if unseen else ""
             if not len(rows):
                 why = "removing any of them is visible"
-            self._record(
-                Cut(f"Gaussians of {name}", "Gaussians", before, before - len(rows), cost, why)
-            )
+            what, after = f"Gaussians of {name}", before - len(rows)
+            self._record(Cut(what, "Gaussians", before, after, cost, why))
 
     def tune(self) -> None:
         """Train with the rest of the budget, less one scoring, at the last rates of the schedules.

@@ -33,7 +33,7 @@ from hoigs.studies.needs.result import (
     Step,
     summary_line,
 )
-from hoigs.studies.plots import DPI, MARKERS, PALETTE, STYLE, framed, scale
+from hoigs.studies.plots import DPI, STYLE, color_of, framed, marker_of, scale
 
 # The answer as a readable spec: what it extends, and each changed key with a reason.
 
@@ -164,8 +164,8 @@ def _panel(axes: Axes, answer: Answer) -> None:
         parameters, error, spread = _point(step)
         taken = step.candidate is answer.chosen
         axes.errorbar(
-            [parameters], [error], yerr=[spread], capsize=2, color=PALETTE[i % len(PALETTE)],
-            marker="*" if taken else MARKERS[i % len(MARKERS)], markersize=13 if taken else 6,
+            [parameters], [error], yerr=[spread], capsize=2, color=color_of(i),
+            marker="*" if taken else marker_of(i), markersize=13 if taken else 6,
             alpha=1.0 if step.steps == longest else 0.45, zorder=3, linestyle="none",
             label=step.candidate.name,
         )  # fmt: skip
@@ -273,17 +273,11 @@ def row(answer: Answer, step: Step) -> list[str]:
         return [step.candidate.name, "–", "–", "–", "–", why]
     score = step.score
     over = "0" if step.over_chosen is None else str(step.over_chosen).removesuffix(" dB")
+    verdict = "chosen" if step.candidate is answer.chosen else "rejected"
+    if step.useless is not None:
+        verdict += f"; where it is the truth, the best gains {step.useless}"
     cells = [f"{score.mean:.2f}", over, f"{score.parameters:,}", str(step.steps)]
-    return [
-        step.candidate.name,
-        *cells,
-        ("chosen" if step.candidate is answer.chosen else "rejected")
-        + (
-            ""
-            if step.useless is None
-            else f"; where it is the truth, the best gains {step.useless}"
-        ),
-    ]
+    return [step.candidate.name, *cells, verdict]
 
 
 def method(needs: Needs) -> list[str]:

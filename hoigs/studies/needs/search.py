@@ -65,7 +65,7 @@ class Search:
     search_spaces: Sequence[SearchSpace]
     given: Sequence[str] = ()
     settings: Settings = field(default_factory=Settings)
-    registry: Registry | None = None
+    registry: Registry = field(default_factory=default_registry)
     device: str = "cpu"
     report: Report = lambda line: None
 
@@ -76,7 +76,6 @@ class Search:
             SpecError, ClipError, BudgetError: the base spec is invalid, there are too few training
                 frames, or too few steps to try anything.
         """
-        self.registry = self.registry or default_registry()
         full = Spec.load(self.base, overrides=self.given, registry=self.registry)
         # as a file, so that candidates change the user's settings block by block
         with tempfile.TemporaryDirectory(prefix="hoigs-needs-") as folder:
@@ -153,18 +152,14 @@ class Search:
         trial = {"train.preview_every": 0, "train.loss.depth_fit": "scale",
                  "train.loss.lpips": 0.0, "train.loss.face": 0.0}  # fmt: skip
         self.budget.spend("pace of a full training", steps + SCORING * len(self.held))
-        spec, registry = self._spec(trial), self._registry()
-        model = Trial(spec, self.view, "background", names, registry, self.device)
+        spec = self._spec(trial)
+        model = Trial(spec, self.view, "background", names, self.registry, self.device)
         paces = []
         for step in range(1, steps + 1):
             began = time.perf_counter()
             model.trainer.train(until=step)
             paces.append(time.perf_counter() - began)
         return median(paces[2:])  # one of them may capture CUDA graphs
-
-    def _registry(self) -> Registry:
-        assert self.registry is not None
-        return self.registry
 
     def _answer(self, space: SearchSpace, block: str, budget: float) -> Answer:
         """Search one space for one block, or give the reason why it is skipped."""
@@ -185,10 +180,9 @@ class Search:
             if not untried:
                 return Answer(space, block, None, skipped=UNTRIED)
             return self._chosen(space, block, untried[0], blocks, skipped=UNTRIED)
-        if space.turn_unknown and not self.settings.smallest and self._turn_unknown(block):
-            return self._chosen(
-                space, block, space.turn_unknown, blocks, skipped=space.turn_unknown.why
-            )
+        unknown = space.turn_unknown
+        if unknown and not self.settings.smallest and self._turn_unknown(block):
+            return self._chosen(space, block, unknown, blocks, skipped=unknown.why)
         held, apart = len(self.held), CALIBRATION * budget if space.calibrated else 0.0
         budget -= apart
         try:
@@ -271,12 +265,7 @@ class Search:
             spec = self._spec(overrides)  # raises: an invalid candidate is an error of its file
             try:
                 trials[candidate.name] = Trial(
-                    spec,
-                    self.view,
-                    space.region,
-                    names,
-                    self._registry(),
-                    self.device,
+                    spec, self.view, space.region, names, self.registry, self.device
                 )
             except SpecError as error:
                 failed[candidate.name] = Step(candidate, problem=str(error))

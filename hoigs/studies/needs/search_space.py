@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import mean, stdev
@@ -111,37 +111,28 @@ def load_search_spaces(path: Path | None = None) -> tuple[SearchSpace, ...]:
 
 
 def _check(search_spaces: Sequence[SearchSpace], path: Path) -> None:
+    def require(
+        name: str | None, known: Iterable[str], key: str, what: str, where: str = ""
+    ) -> None:
+        if name is not None and name not in known:
+            near = did_you_mean(name, known)
+            raise HoigsError(f"{path} {key}: no {what} {name!r}{where}{near}")
+
     before: dict[str, list[str]] = {}
     for space in search_spaces:
         names = [candidate.name for candidate in space.candidates]
-        if space.untried is not None and space.untried not in names:
-            near = did_you_mean(space.untried, names)
-            raise HoigsError(
-                f"{path} {space.name}.untried: it has no candidate {space.untried!r}{near}"
-            )
+        require(space.untried, names, f"{space.name}.untried", "candidate")
         for place, candidate in enumerate(space.candidates):
-            if candidate.moves_unlike not in (None, *names[:place]):
-                near = did_you_mean(str(candidate.moves_unlike), names[:place])
-                raise HoigsError(
-                    f"{path} {space.name}.{candidate.name}.moves_unlike: no candidate "
-                    f"{candidate.moves_unlike!r} above it{near}"
-                )
+            key = f"{space.name}.{candidate.name}.moves_unlike"
+            require(candidate.moves_unlike, names[:place], key, "candidate", " above it")
         if len(set(names)) < len(names) or space.name in before:
             raise HoigsError(
                 f"{path} {space.name}: search spaces and their candidates need unique names"
             )
         for other, candidates in space.unless.items():
-            if other not in before:
-                near = did_you_mean(other, before)
-                raise HoigsError(
-                    f"{path} {space.name}.unless: no search space {other!r} above it{near}"
-                )
+            require(other, before, f"{space.name}.unless", "search space", " above it")
             for name in candidates:
-                if name not in before[other]:
-                    near = did_you_mean(name, before[other])
-                    raise HoigsError(
-                        f"{path} {space.name}.unless: {other} has no candidate {name!r}{near}"
-                    )
+                require(name, before[other], f"{space.name}.unless", "candidate", f" of {other}")
         before[space.name] = names
 
 

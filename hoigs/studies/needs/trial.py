@@ -44,24 +44,14 @@ class SealedFrameError(RuntimeError):
     """A test frame was read during the choice of a model."""
 
 
-class SealedStore(FrameStore):
-    """Another store, some frames of which cannot be read.
+class OverStore(FrameStore):
+    """Another store as it is; subclasses change a part of it."""
 
-    Args:
-        base: the other store. sealed: positions whose frames raise SealedFrameError.
-    """
-
-    def __init__(self, base: FrameStore, sealed: Iterable[int]) -> None:
-        self.base, self.sealed = base, frozenset(sealed)
-        self.root = base.root
+    def __init__(self, base: FrameStore) -> None:
+        self.base, self.root = base, base.root
 
     def _open(self, position: int) -> FrameStore:
-        if position in self.sealed:
-            raise SealedFrameError(
-                f"frame {position} is a test frame, and a model may not be chosen by it: the "
-                "component that read it (an initializer, for example) may read clip.split['train'] "
-                "only"
-            )
+        """The store that has a frame."""
         return self.base
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
@@ -78,6 +68,27 @@ class SealedStore(FrameStore):
 
     def mask_known(self, entity: str, position: int) -> bool:
         return self._open(position).mask_known(entity, position)
+
+
+class SealedStore(OverStore):
+    """Another store, some frames of which cannot be read.
+
+    Args:
+        base: the other store. sealed: positions whose frames raise SealedFrameError.
+    """
+
+    def __init__(self, base: FrameStore, sealed: Iterable[int]) -> None:
+        super().__init__(base)
+        self.sealed = frozenset(sealed)
+
+    def _open(self, position: int) -> FrameStore:
+        if position in self.sealed:
+            raise SealedFrameError(
+                f"frame {position} is a test frame, and a model may not be chosen by it: the "
+                "component that read it (an initializer, for example) may read clip.split['train'] "
+                "only"
+            )
+        return self.base
 
 
 def selection_frames(train: Sequence[int], share: float = 0.05, least: int = 3) -> list[int]:
@@ -184,10 +195,6 @@ class Trial:
             objectives=compose_objectives(spec, view, registry),
         )  # fmt: skip
         self.seconds = 0.0
-
-    @property
-    def parameters(self) -> int:
-        return sum(p.numel() for p in self.model.parameters() if p.requires_grad)
 
     def on(self, view: Clip) -> Trial:
         """The same trial from its beginning, on a view with other images."""
@@ -322,10 +329,9 @@ class Validator:
                 frame.camera.to(model.device),
                 request=RenderRequest(subset=subset),
             )
-            squares = _squares(output.color, frame.rgb)
-            masks = region_masks(
-                frame, self.clip.kinds, default_band(frame.camera.width, frame.camera.height)
-            )
+            squares = (output.color.cpu().clamp(0, 1) - frame.rgb).square().mean(-1)
+            band = default_band(frame.camera.width, frame.camera.height)
+            masks = region_masks(frame, self.clip.kinds, band)
             for region in WATCHED:
                 if masks[region].any():
                     error = squares[masks[region]].mean()
@@ -336,11 +342,6 @@ class Validator:
                 "the model cannot be scored on them"
             )
         return Scores({region: mean(found) for region, found in values.items()})
-
-
-def _squares(color: Tensor, target: Tensor) -> Float[Tensor, "H W"]:
-    """Squared error of each pixel, mean over RGB."""
-    return (color.cpu().clamp(0, 1) - target).square().mean(-1)
 
 
 # A trained model with its spec, and the same model composed anew under a smaller spec.

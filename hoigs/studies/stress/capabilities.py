@@ -5,18 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.model.compose import compose, compose_density
+from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import default_registry
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
-
-if TYPE_CHECKING:
-    from hoigs.core.model.entity import Entity
-
 
 # Capabilities of a composed model: a case concerns models by these, not by the spec's name.
 
@@ -49,12 +46,8 @@ def capabilities(model: SceneModel, density: Mapping[str, DensityControl]) -> fr
 
 def _found(model: SceneModel, density: Mapping[str, DensityControl]) -> Iterator[Capability]:
     names = {kind: model.names(kind) for kind in ("scene", "human", "object")}
-    if names["scene"]:
-        yield "scene"
-    if names["human"]:
-        yield "body"
-    if names["object"]:
-        yield "object"
+    kinds: dict[str, Capability] = {"scene": "scene", "human": "body", "object": "object"}
+    yield from (word for kind, word in kinds.items() if names[kind])
     if names["human"] or names["object"]:
         yield "masks"
     elif names["scene"]:
@@ -94,7 +87,6 @@ def rate_of(name: str, rates: Mapping[str, str]) -> str:
 
 
 # Settings that adapt a spec to a small clip and a short training.
-
 
 # shares of all points, where a spec has such a block
 SHARES = {"human": 0.3, "object": 0.1}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.interfaces.rasterizer import RenderRequest
@@ -63,13 +63,10 @@ def scored_values(evaluation: Mapping[str, Any]) -> dict[str, Value]:
     """Every number of MEASURES in an evaluation.json of a stress run."""
     usual, own = measures_of(evaluation), evaluation[STRESS]
     absent = NotComputed("this evaluation has no such score")
-    found: dict[str, Value] = {}
-    for name, measure in MEASURES.items():
-        if measure.place is not None:
-            found[name] = usual.get(measure.place, absent)
-            continue
-        found[name] = from_json(own[name])
-    return found
+    return {
+        name: from_json(own[name]) if measure.place is None else usual.get(measure.place, absent)
+        for name, measure in MEASURES.items()
+    }
 
 
 # Measures beyond those of evaluation: outlines, coverage, and drift of the object.
@@ -121,14 +118,12 @@ def _iou(
     """Mean IoU over frames that show the kind: pixels with a share above 0.5 against its masks."""
     if not model.names(kind):
         return NotComputed(f"the model does not separate the {kind} from the rest")
-    values = []
-    for frame, share in zip(frames, shares, strict=True):
-        masks = [m for name, m in frame.masks.items() if clip.kinds[name] == kind]
-        true = torch.stack(masks).any(0)
+
+    def iou(true: Bool[Tensor, "H W"], share: Float[Tensor, "H W 3"]) -> Tensor:
         drawn = share[..., KINDS.index(kind)] > 0.5
-        if true.any():
-            values.append(float((true & drawn).sum() / (true | drawn).sum()))
-    return float(np.mean(values)) if values else NotComputed(f"no test frame shows the {kind}")
+        return (true & drawn).sum() / (true | drawn).sum()
+
+    return _mean_over(kind, clip, frames, shares, iou)
 
 
 def _covered(
@@ -137,13 +132,23 @@ def _covered(
     """Mean share of the scene in pixels of the human's mask."""
     if not model.names("human") or not model.names("scene"):
         return NotComputed("the model does not separate the human from the scene")
+    return _mean_over("human", clip, frames, shares, lambda true, share: share[true][:, 0].mean())
+
+
+def _mean_over(
+    kind: str,
+    clip: Clip,
+    frames: list[Frame],
+    shares: list[Float[Tensor, "H W 3"]],
+    measure: Callable[[Bool[Tensor, "H W"], Float[Tensor, "H W 3"]], Tensor],
+) -> Value:
+    """Mean of a measure of masks and shares, over the frames that show the kind."""
     values = []
     for frame, share in zip(frames, shares, strict=True):
-        masks = [m for name, m in frame.masks.items() if clip.kinds[name] == "human"]
-        true = torch.stack(masks).any(0)
+        true = torch.stack([m for n, m in frame.masks.items() if clip.kinds[n] == kind]).any(0)
         if true.any():
-            values.append(float(share[..., 0][true].mean()))
-    return float(np.mean(values)) if values else NotComputed("no test frame shows the human")
+            values.append(float(measure(true, share)))
+    return float(np.mean(values)) if values else NotComputed(f"no test frame shows the {kind}")
 
 
 def _drift(clip: Clip, error: Value) -> Value:

@@ -19,7 +19,16 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from hoigs.core.system.files import write_whole
-from hoigs.studies.plots import INK, MARKERS, PALETTE, QUIET, STYLE, framed, short_number
+from hoigs.studies.plots import (
+    INK,
+    QUIET,
+    STYLE,
+    color_of,
+    figure_files,
+    framed,
+    marker_of,
+    short_number,
+)
 from hoigs.studies.stress.capabilities import MEANING as HAS
 from hoigs.studies.stress.case import Case
 from hoigs.studies.stress.verdict import (
@@ -39,8 +48,6 @@ MARKS = {"pass": "✓", "fail": "✗", "limitation": "◐", "not applicable": "�
 
 def write_stress(table: Table, out: Path) -> list[Path]:
     """All files, each whole or not at all; curves only if a sweep has run."""
-    from hoigs.studies.plots import figure_files
-
     out.mkdir(parents=True, exist_ok=True)
     files: dict[str, bytes] = {
         "stress.json": as_json(table).encode(),
@@ -138,9 +145,8 @@ def breakdown(table: Table, title: str) -> Figure | None:
                 axes.axis("off")
             else:
                 _panel(axes, table, case)
-        looks = [
-            Line2D([], [], color=_color(i), marker=_marker(i)) for i in range(len(table.specs))
-        ]
+        every = range(len(table.specs))
+        looks = [Line2D([], [], color=color_of(i), marker=marker_of(i)) for i in every]
         figure.legend(looks, table.specs, loc="outside right upper")
     return figure
 
@@ -162,8 +168,8 @@ def _panel(axes: Any, table: Table, case: Case) -> None:
         shift = 0.05 * (i - (len(table.specs) - 1) / 2)  # so that bars do not hide each other
         x, spreads = [places[value] + shift for value in points], points.values()
         axes.errorbar(
-            x, [s.mean for s in spreads], yerr=[s.std or 0 for s in spreads], color=_color(i),
-            marker=_marker(i), markersize=4.5, linewidth=1.4, elinewidth=0.9, capsize=0, zorder=3,
+            x, [s.mean for s in spreads], yerr=[s.std or 0 for s in spreads], color=color_of(i),
+            marker=marker_of(i), markersize=4.5, linewidth=1.4, elinewidth=0.9, capsize=0, zorder=3,
         )  # fmt: skip
         broken = table.at(case, spec).breaks_at
         if broken in points:
@@ -176,14 +182,6 @@ def _panel(axes: Any, table: Table, case: Case) -> None:
     heading = textwrap.fill(f"{case.id} {case.title}", 44)
     axes.set_title(f"{heading}\n", loc="left", size=9.5, weight="bold", color=INK)
     axes.text(0, 1.03, axis_title(case), transform=axes.transAxes, size=8.5, color=QUIET)
-
-
-def _color(index: int) -> str:
-    return PALETTE[index % len(PALETTE)]
-
-
-def _marker(index: int) -> str:
-    return MARKERS[index % len(MARKERS)]
 
 
 # The matrix: cases down, specs across, a colour for each verdict.

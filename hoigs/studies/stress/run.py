@@ -117,8 +117,6 @@ def plan_chains(
     Args:
         capabilities: of each spec, by label.
     """
-    from hoigs.core.registry.registry import default_registry
-
     folders, registry = ClipFolders(), default_registry(list(study.plugins))
     own = {
         row.label: Spec.load(
@@ -305,10 +303,7 @@ def _train(
 
 
 def _verdict(
-    case: Case,
-    label: str,
-    has: frozenset[Capability],
-    progress: Sequence[_Progress],
+    case: Case, label: str, has: frozenset[Capability], progress: Sequence[_Progress]
 ) -> Verdict:
     lacks = [MEANING[c] for c in case.concerns if c not in has]
     if lacks:

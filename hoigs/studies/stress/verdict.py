@@ -163,13 +163,9 @@ def breaking(sweep: Sweep, seeds: Sequence[Seed]) -> float | None:
 
 def middle_of(seeds: Sequence[Seed], value: float, measure: str) -> list[float]:
     """The numbers of all seeds that have one at a value."""
-    found = []
-    for seed in seeds:
-        for level in seed.levels:
-            number = level.values.get(measure)
-            if level.value == value and isinstance(number, float):
-                found.append(number)
-    return found
+    levels = [level for seed in seeds for level in seed.levels if level.value == value]
+    numbers = [level.values.get(measure) for level in levels]
+    return [number for number in numbers if isinstance(number, float)]
 
 
 # Verdicts of a study as a table, from which matrix, curves and files are made.

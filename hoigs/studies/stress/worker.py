@@ -8,7 +8,7 @@ from pathlib import Path
 from hoigs.core.system.files import write_whole
 from hoigs.studies.jobs.job import SCORES
 from hoigs.studies.jobs.worker import main, train_job
-from hoigs.studies.stress.measures import STRESS
+from hoigs.studies.stress.measures import STRESS, observe
 from hoigs.studies.stress.run import StressJob
 
 
@@ -16,7 +16,6 @@ def run_job(job: StressJob, runs_at_once: int = 1) -> None:
     """Train and score; times of rendering are not measured."""
     from hoigs.evaluation.evaluate import score
     from hoigs.runs.clip_source import read_clip
-    from hoigs.studies.stress.measures import observe
 
     loaded = train_job(job, runs_at_once, allow_faults=job.allow_faults)
     if loaded is None:

@@ -16,7 +16,7 @@ from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.compositing import project_gaussians
 from hoigs.testing.checks import CheckError, require, require_close, require_finite, require_zero
-from hoigs.testing.rasterizer.drawing import squares
+from hoigs.testing.rasterizer.drawing import require_same_images, squares
 from hoigs.testing.rasterizer.subject import (
     CHECKS,
     RAW,
@@ -28,6 +28,7 @@ from hoigs.testing.rasterizer.subject import (
     forged,
     front_camera,
     images,
+    on,
     one_gaussian,
     random_gaussians,
     random_scene,
@@ -133,12 +134,14 @@ def wrong_input_is_refused_by_name(subject: RasterizerSubject) -> None:
     """Wrong shapes, dtypes and limits raise a RenderError that names backend and field."""
     for part, mistakes in WRONG.items():
         for changes in mistakes:
-            values = {"gaussians": GOOD, "camera": front_camera(), "request": RenderRequest()}
-            message = _refusal(subject, **{**values, part: forged(values[part], **changes)})
+            values: dict[str, Any] = {
+                "gaussians": GOOD, "camera": front_camera(), "request": RenderRequest()
+            }  # fmt: skip
             (field,) = changes
+            values[part] = forged(values[part], **changes)
+            message = _refusal(subject, f"a wrong {part}.{field}", **values)
             name = type(subject.rasterizer).__name__
-            require(message is not None, f"a wrong {part}.{field} was drawn")
-            named = name in (message or "") and (field in (message or "") or part == "camera")
+            named = name in message and (field in message or part == "camera")
             require(named, f"the error for {part}.{field} names neither: {message}")
 
 
@@ -146,11 +149,7 @@ def wrong_input_is_refused_by_name(subject: RasterizerSubject) -> None:
 def another_device_is_refused(subject: RasterizerSubject) -> None:
     """A camera or features on another device than the Gaussians are refused by name."""
     gaussians, camera = GOOD.to(subject.device), front_camera()
-    here = replace(
-        camera,
-        K=camera.K.to(subject.device),
-        world_to_camera=camera.world_to_camera.to(subject.device),
-    )
+    here = on(subject.device, camera)
     nowhere = replace(here, K=torch.eye(3, device="meta"))
     elsewhere = RenderRequest(features=torch.zeros(6, 2, device="meta"))
     for view, request in ((nowhere, None), (here, elsewhere)):
@@ -168,19 +167,21 @@ def fixed_options_are_refused_by_name(subject: RasterizerSubject) -> None:
     for option, value in subject.rasterizer.capabilities.fixed.items():
         other = not value if isinstance(value, bool) else value * 0.5
         request = RenderRequest().replace(**{option: other})
-        message = _refusal(subject, GOOD, front_camera(), request)
-        require(message is not None, f"request.{option} = {other} was drawn")
-        named = option in (message or "") and str(value) in (message or "")
+        what = f"request.{option} = {other}"
+        message = _refusal(subject, what, GOOD, front_camera(), request)
+        named = option in message and str(value) in message
         require(named, f"the error does not name {option} and {value}: {message}")
 
 
-def _refusal(subject: RasterizerSubject, gaussians: Any, camera: Any, request: Any) -> str | None:
-    """The message of the RenderError, or None when it was drawn."""
+def _refusal(
+    subject: RasterizerSubject, what: str, gaussians: Any, camera: Any, request: Any
+) -> str:
+    """The message of the RenderError that `what` has to raise."""
     try:
         subject.render(gaussians, camera, request)
     except RenderError as error:
         return str(error)
-    return None
+    raise CheckError(f"{what} was drawn")
 
 
 # R60 to R66: broken and extreme numbers affect only the rows that hold them.
@@ -341,9 +342,8 @@ def large_values_change_only_their_pixels(subject: RasterizerSubject) -> None:
     output, gradients = subject.drawn(corrupted(plain, enlarge), elsewhere)
     for name, image in images(wanted).items():
         got = images(output)[name].detach().cpu()[~covered]
-        require_close(
-            f"{name} elsewhere", got, image.detach().cpu()[~covered], atol=2e-6, rtol=1e-5
-        )
+        want = image.detach().cpu()[~covered]
+        require_close(f"{name} elsewhere", got, want, atol=2e-6, rtol=1e-5)
     others = ~alone
     for name in ROWS:
         actual, want = received(gradients, name), received(wanted_gradients, name)
@@ -416,8 +416,7 @@ def infinite_logits_are_opaque_or_nothing(subject: RasterizerSubject) -> None:
             )
             for x in (logits, finite)
         )
-        for name, image in images(wanted).items():
-            require_close(name, images(output)[name], image, atol=2e-6, rtol=1e-5)
+        require_same_images(output, wanted)
         for name in gradients:
             gradient, want = received(gradients, name), received(wanted_gradients, name)
             size = float(want.abs().max())

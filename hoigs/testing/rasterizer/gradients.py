@@ -110,9 +110,8 @@ def screen_offsets_get_the_screen_space_gradient(subject: RasterizerSubject) -> 
         moved = RenderRequest(screen_offsets=shifted)
         losses.append(ORACLE.render(scene.gaussians, scene.camera, moved).color.square().sum())
     slope = (losses[0] - losses[1]) / 2e-4
-    require_close(
-        f"gradient of screen_offsets[{seen}, 0]", slopes[seen, 0], slope, atol=0.0, rtol=1e-3
-    )
+    what = f"gradient of screen_offsets[{seen}, 0]"
+    require_close(what, slopes[seen, 0], slope, atol=0.0, rtol=1e-3)
 
 
 @CHECKS.check("R46")

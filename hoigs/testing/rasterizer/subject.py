@@ -6,7 +6,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -28,10 +28,7 @@ from hoigs.testing.checks import (
     require_finite,
     require_zero,
 )
-
-if TYPE_CHECKING:
-    from hoigs.testing.runner import Options
-
+from hoigs.testing.runner import Options
 
 # Small scenes for rasterizers, made on the CPU in float32, the same on every machine.
 
@@ -225,19 +222,19 @@ def subject(cls: type[Rasterizer], config: Any, options: Options) -> RasterizerS
     return RasterizerSubject(cls.from_config(config, BuildContext()), torch.device(options.device))
 
 
-def camera_gradients(subject: RasterizerSubject) -> str | None:
-    declared = subject.rasterizer.capabilities.camera_gradients
-    return None if declared else "camera_gradients is not declared"
+def declared(capability: str) -> Need:
+    """The backend declares this field of its capabilities."""
+
+    def need(subject: RasterizerSubject) -> str | None:
+        found = getattr(subject.rasterizer.capabilities, capability)
+        return None if found else f"{capability} is not declared"
+
+    return need
 
 
-def absolute_gradients(subject: RasterizerSubject) -> str | None:
-    declared = subject.rasterizer.capabilities.absolute_gradients
-    return None if declared else "absolute_gradients is not declared"
-
-
-def deterministic(subject: RasterizerSubject) -> str | None:
-    declared = subject.rasterizer.capabilities.deterministic
-    return None if declared else "deterministic is not declared"
+camera_gradients = declared("camera_gradients")
+absolute_gradients = declared("absolute_gradients")
+deterministic = declared("deterministic")
 
 
 def float64(subject: RasterizerSubject) -> str | None:

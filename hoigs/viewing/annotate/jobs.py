@@ -88,16 +88,13 @@ class Job:
         if self._stopped:
             self._update({"state": "stopped"})
         elif self.running:
-            self._update({"state": "failed", "error": self._crash(code)})
+            what = f"the preparation ended unexpectedly (exit status {code}):"
+            self._update({"state": "failed", "error": "\n".join([what, *self._last]).strip()})
 
     def _update(self, event: dict[str, Any]) -> None:
         with self._lock:
             if self._state["state"] == "running" or self._stopped:
                 self._state.update(event)
-
-    def _crash(self, code: int) -> str:
-        last = "\n".join(self._last)
-        return f"the preparation ended unexpectedly (exit status {code}):\n{last}".strip()
 
 
 class Jobs:

@@ -65,7 +65,6 @@ class _Known:
     away: Float[np.ndarray, "h w"]
 
     def difference(self, i: int) -> Float[np.ndarray, "h w"]:
-        del i
         return self.away
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from PIL import Image
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 from hoigs.core.clip_folder.format import is_clip_folder
@@ -276,8 +277,6 @@ class Session:
 
 def _png(mask: np.ndarray) -> bytes:
     """A mask as the opacity of a picture, which the page colours."""
-    from PIL import Image
-
     height, width = mask.shape
     alpha = Image.fromarray(mask.astype(np.uint8) * 255)
     if width > MASK_WIDTH:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
+from PIL import Image
 
 from hoigs.core.system.video_files import pyav
 from hoigs.preparation.video.container import open_video, packet_index
@@ -98,8 +99,6 @@ class ScrubbedVideo:
 
     def jpeg(self, number: int, width: int) -> bytes:
         """One frame, encoded; those looked at lately are kept."""
-        from PIL import Image
-
         key = (number, width)
         with self._lock:
             found = self._encoded.get(key)

@@ -36,14 +36,13 @@ def run(
         _say(**rows, notes=plan.notes)
 
     given = PrepareOptions.model_validate({**options, "overwrite": replace})
+    how: dict[str, Any] = {
+        "options": given, "yes": yes, "announce": announce, "progress": progress
+    }  # fmt: skip
     if not whole:
-        prepare_until(
-            TRACKED, video, out, options=given, yes=yes, announce=announce, progress=progress
-        )
+        prepare_until(TRACKED, video, out, **how)
         return
-    report = prepare(
-        video, out, options=given, yes=yes, announce=announce, progress=progress
-    )  # fmt: skip
+    report = prepare(video, out, **how)
     _say(rows=report.rows(), warnings=list(report.warnings))
 
 

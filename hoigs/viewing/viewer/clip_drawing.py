@@ -29,7 +29,6 @@ class ClipDrawing:
 
     def draw(self, frame: float, camera: Camera, look: Look, depth: bool = False) -> Picture:
         """The nearest frame of the video in a picture of the camera's size; it has no depth."""
-        del depth
         position = nearest_position(self.clip, frame)
         image = self._depth(position) if look.mode == "depth" else self._frame(position, look)
         return Picture(placed(image, (camera.width, camera.height)))

@@ -94,10 +94,6 @@ class Settings:
     overlays: set[str] = field(default_factory=set)
     see_through: bool = False
 
-    @staticmethod
-    def initial(modes: Sequence[str], entities: Sequence[str]) -> Settings:
-        return Settings(modes[0], set(entities))
-
     @property
     def look(self) -> Look:
         return Look(self.mode, frozenset(self.entities), self.interaction, self.background)
@@ -224,9 +220,8 @@ class Controls:
             if drawing.has_interaction:
                 self._bind(gui.add_checkbox("interaction", settings.interaction), "interaction")
             if drawing.anywhere:
-                start = next(
-                    n for n, c in choices.items() if c == (settings.layout, settings.other)
-                )
+                given = (settings.layout, settings.other)
+                start = next(name for name, choice in choices.items() if choice == given)
                 compare = gui.add_dropdown("Beside", tuple(choices), initial_value=start)
                 self._bind(gui.add_slider("Wipe or blend", 0.0, 1.0, 0.01, settings.share), "share")
                 paint = gui.add_rgb("Background", (0, 0, 0))

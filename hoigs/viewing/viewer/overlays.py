@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,8 +45,7 @@ class PosedBody:
 
     @property
     def faces(self) -> Int[np.ndarray, "F 3"]:
-        array: np.ndarray = self.body.faces.cpu().numpy()
-        return array
+        return self.body.faces.cpu().numpy()
 
     @property
     def bones(self) -> Int[np.ndarray, "E 2"]:
@@ -82,16 +82,12 @@ def bodies_of_clip(clip: Clip, registry: Registry) -> tuple[dict[str, PosedBody]
         except (HoigsError, ValidationError) as error:
             missing[name] = f"no body mesh: {track.model}: {str(error).splitlines()[0]}"
             continue
-        found[name] = PosedBody(body, _reader(name), clip)
+        found[name] = PosedBody(body, partial(_pose_of, name), clip)
     return found, missing
 
 
-def _reader(name: str) -> Callable[[Moment], BodyPose]:
-    def pose(moment: Moment) -> BodyPose:
-        poses: Mapping[str, BodyPose] = moment.poses
-        return poses[name]
-
-    return pose
+def _pose_of(name: str, moment: Moment) -> BodyPose:
+    return moment.poses[name]
 
 
 CAMERAS = 24  # frusta that are drawn at most
@@ -207,7 +203,6 @@ class Overlays:
         self._place("object points", "", frame)
 
     def _make_scene_points(self, frame: float) -> Any:
-        del frame
         yield self.scene.add_point_cloud(
             "/scene_points", self.clip.points.numpy(), _bytes(self.clip.point_colors),
             point_size=0.003 * self.size,
@@ -224,7 +219,6 @@ class Overlays:
         node.points, node.colors = self._depth_points(frame)
 
     def _make_cameras(self, frame: float) -> Any:
-        del frame
         yield from self._frusta("/cameras", images=False)
         centers = np.stack([c.center.numpy() for c in self.clip.cameras])
         if len(centers) > 1:
@@ -232,7 +226,6 @@ class Overlays:
             yield self.scene.add_line_segments("/cameras/path", segments, (255, 200, 80))
 
     def _make_camera_images(self, frame: float) -> Any:
-        del frame
         yield from self._frusta("/camera_images", images=True)
 
     def _frusta(self, place: str, images: bool) -> Any:
@@ -277,13 +270,11 @@ class Overlays:
 
 
 def _quat(rotation: torch.Tensor) -> np.ndarray:
-    array: np.ndarray = matrices_to_quats(rotation).numpy()
-    return array
+    return matrices_to_quats(rotation).numpy()
 
 
 def _bytes(colors: torch.Tensor) -> np.ndarray:
-    array: np.ndarray = (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-    return array
+    return (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def _rgb(color: tuple[float, float, float]) -> tuple[int, int, int]:

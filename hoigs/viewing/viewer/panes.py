@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from hoigs.core.values.between import in_shape
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
 
@@ -92,8 +91,3 @@ def inner_rectangle(image: tuple[int, int], canvas: tuple[int, int]) -> tuple[in
     scale = min(canvas[0] / image[0], canvas[1] / image[1])
     width, height = max(1, round(image[0] * scale)), max(1, round(image[1] * scale))
     return (canvas[0] - width) // 2, (canvas[1] - height) // 2, width, height
-
-
-def fitted(camera: Camera, canvas: tuple[int, int]) -> Camera:
-    """The camera with its whole image in the middle of a canvas of another size and aspect."""
-    return in_shape(camera, *canvas)

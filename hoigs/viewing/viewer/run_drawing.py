@@ -150,7 +150,7 @@ class RunDrawing:
         if look.mode == "entity":
             colors = self._entity_colors(gaussians)
         if colors is not None:
-            gaussians = _recoloured(gaussians, colors)
+            gaussians = replace(gaussians, sh=((colors - 0.5) / SH_C0)[:, None])
         shown = [rows for name, rows in self.rows().items() if name in look.entities]
         if len(shown) < len(self.names):
             parts = [gaussians[rows] for rows in shown]
@@ -234,17 +234,9 @@ def entity_colors(names: Sequence[str]) -> dict[str, tuple[float, float, float]]
     return {n: SCENE if n == "scene" else PALETTE[moving.index(n) % len(PALETTE)] for n in names}
 
 
-def _recoloured(gaussians: Gaussians, colors: Float[Tensor, "N 3"]) -> Gaussians:
-    return replace(gaussians, sh=((colors - 0.5) / SH_C0)[:, None])
-
-
 def _far(output: RenderOutput) -> Float[np.ndarray, "H W"]:
     """Depth in metres as viser composites it: FAR where the picture is more than half empty."""
-    depth = torch.where(
-        output.alpha > 0.5, output.expected_depth, torch.full_like(output.alpha, FAR)
-    )
-    array: np.ndarray = depth.float().cpu().numpy()
-    return array
+    return torch.where(output.alpha > 0.5, output.expected_depth, FAR).float().cpu().numpy()
 
 
 # Resolution: how many pixels are drawn while the picture moves, so that each fits its time.

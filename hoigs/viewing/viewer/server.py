@@ -30,7 +30,6 @@ def open_server(host: str, port: int, label: str) -> Any:
     class Server(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> str | None:
             """No public tunnel: a browser may request one, which would end loopback."""
-            del verbose
             return None
 
     _require_free(host, port)

@@ -14,6 +14,7 @@ from pathlib import Path as FilePath
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from PIL import Image
 
 from hoigs.core.maths.rotations import matrices_to_quats, quats_to_matrices, slerp
 from hoigs.core.system.video_files import write_video
@@ -35,12 +36,9 @@ class Path:
 
     def __str__(self) -> str:
         frames = ", ".join(f"{frame:.1f}" for frame, _ in self.keys)
+        places = f", at frames {frames}" if frames else ""
         more = "" if len(self.keys) > 1 else " A film needs two or more."
-        return (
-            f"Views on the path: {len(self.keys)}"
-            + (f", at frames {frames}." if frames else ".")
-            + more
-        )
+        return f"Views on the path: {len(self.keys)}{places}.{more}"
 
     def at(self, share: float) -> tuple[float, View]:
         """Frame number and view at a share of the path, in [0, 1].
@@ -76,10 +74,7 @@ class Film:
     """
 
     def __init__(
-        self,
-        path: Path,
-        seconds: float,
-        draw: Callable[[float, View], UInt8[np.ndarray, "H W 3"]],
+        self, path: Path, seconds: float, draw: Callable[[float, View], UInt8[np.ndarray, "H W 3"]]
     ) -> None:
         self.drawn, self.count = 0, max(2, round(seconds * FILM_FPS))
         self._path, self._draw = Path(list(path.keys)), draw
@@ -122,8 +117,6 @@ class Film:
 
 def png(image: UInt8[np.ndarray, "H W 3"]) -> bytes:
     """An image as the bytes of a PNG file."""
-    from PIL import Image
-
     buffer = BytesIO()
     Image.fromarray(image).save(buffer, "png")
     return buffer.getvalue()

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from hoigs.core.values.between import camera_between, frame_of, moment_between
+from hoigs.core.values.between import camera_between, frame_of, in_shape, moment_between
 from hoigs.core.values.camera import Camera
 from hoigs.viewing.viewer import takes
 from hoigs.viewing.viewer.controls import Clock, Controls, Settings
 from hoigs.viewing.viewer.eyes import STILL_S, Eye
 from hoigs.viewing.viewer.overlays import AT_THE_CAMERA, IN_PLACE_OF_FRAMES, Overlays, PosedBody
-from hoigs.viewing.viewer.panes import Draw, fitted, inner_rectangle, joined, source_frame
+from hoigs.viewing.viewer.panes import Draw, inner_rectangle, joined, source_frame
 from hoigs.viewing.viewer.run_drawing import FAR, Drawing, Picture, RunDrawing
 from hoigs.viewing.viewer.views import View
 
@@ -90,7 +90,7 @@ class Viewer:
     def initial(self) -> Settings:
         """What a new visitor sees: the video's own camera; a drag orbits about the person."""
         first = self.drawings[0]
-        settings = Settings.initial(first.modes, first.names)
+        settings = Settings(first.modes[0], set(first.names))
         moving = [name for name in first.names if name != "scene"]
         people = [name for name in moving if self.clip.kinds.get(name) == "human"]
         settings.follow = next(iter(people or moving), None)
@@ -247,7 +247,7 @@ class Viewer:
 
         def camera_of(canvas: tuple[int, int]) -> Camera:
             if settings.video:
-                return fitted(camera_between(self.clip, frame), canvas)
+                return in_shape(camera_between(self.clip, frame), *canvas)
             return view.camera(canvas)
 
         first, look = self.drawings[0], settings.look
@@ -284,9 +284,8 @@ class Viewer:
             names = frozenset(second.names) & look.entities
             return second.draw(there, camera, replace(look, entities=names)).image
 
-        return Picture(
-            joined(settings.layout, settings.share, size, camera_of, draw_first, draw_second)
-        )
+        layout, share = settings.layout, settings.share
+        return Picture(joined(layout, share, size, camera_of, draw_first, draw_second))
 
     def _own_frame(
         self, frame: float, canvas: tuple[int, int]
@@ -295,7 +294,7 @@ class Viewer:
         left, top, width and height."""
         camera = camera_between(self.clip, frame)
         place = inner_rectangle((camera.width, camera.height), canvas)
-        return fitted(camera, place[2:]), place
+        return in_shape(camera, *place[2:]), place
 
     def _tell(
         self, visit: Visit, size: tuple[int, int], moving: bool, took: float, now: float

@@ -71,13 +71,7 @@ class View:
         apart = float(np.linalg.norm(self.position - other.position)) / scale
         return apart < tolerance and bool(np.abs(self.rotation - other.rotation).max() < tolerance)
 
-    def apply(self, camera: Any, up: Vector | None = None) -> None:
-        """Set the camera of a viser client.
-
-        Args:
-            up: in place of `self.up`, as it also decides how a drag turns the camera.
-        """
-        camera.position = self.position
-        camera.look_at = self.target
-        camera.up_direction = self.up if up is None else up
-        camera.fov = self.fov
+    def apply(self, camera: Any) -> None:
+        """Set the camera of a viser client."""
+        camera.position, camera.look_at = self.position, self.target
+        camera.up_direction, camera.fov = self.up, self.fov

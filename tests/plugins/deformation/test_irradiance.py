@@ -16,12 +16,7 @@ from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.articulated import Articulated
 from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.hexplane_skinning import HexPlaneSkinning, HexPlaneSkinningConfig
-from hoigs.plugins.deformation.irradiance import (
-    TERMS,
-    Irradiance,
-    outward_normals,
-    turned_normals,
-)
+from hoigs.plugins.deformation.irradiance import TERMS, Irradiance, outward_normals, turned_normals
 from hoigs.plugins.deformation.keyframes import Keyframed
 from hoigs.plugins.deformation.rigid_spline import RigidSpline
 from hoigs.plugins.deformation.tracked_chs import TrackedHermite

@@ -77,10 +77,7 @@ def test_cap_takes_the_largest_gradients():
 
 def test_count_never_exceeds_the_cap():
     torch.manual_seed(0)
-    control, canonical = (
-        adaptive_density(cap=200, threshold=1e-6),
-        cloud([0.3] * 20),
-    )
+    control, canonical = (adaptive_density(cap=200, threshold=1e-6), cloud([0.3] * 20))
     for step in range(100, 500, 100):
         decision = refine(control, canonical, statistics(torch.rand(len(canonical))), step)
         canonical = decision.canonical or canonical
@@ -100,12 +97,7 @@ def test_keyed_opacity_low_at_one_moment_is_no_reason():
     canonical = cloud([0.01] * 20)
     hidden = canonical.replace(opacity_logits=torch.full((20,), -12.0))
     assert (
-        refine(
-            adaptive_density(keep=1),
-            canonical,
-            statistics([0.0] * 20),
-            current=hidden,
-        ).change
+        refine(adaptive_density(keep=1), canonical, statistics([0.0] * 20), current=hidden).change
         is None
     )
 
@@ -169,11 +161,7 @@ def test_keyed_opacities_are_judged_at_their_largest():
     with torch.no_grad():
         entity.deformation.opacity_logits.fill_(-9.0)
         entity.deformation.opacity_logits[:15, 2] = 0.0
-    decision = refine(
-        adaptive_density(keep=1),
-        entity.at_peak.detach(),
-        statistics([0.0] * 20),
-    )
+    decision = refine(adaptive_density(keep=1), entity.at_peak.detach(), statistics([0.0] * 20))
     assert decision.change.source.tolist() == list(range(15))
 
 

@@ -99,7 +99,7 @@ def test_inconsistent_data_is_told(builtin: Clip, tmp_path: Path) -> None:
     for change, message in (
         (
             lambda: data["entities"]["object"].update(object_poses=poses[:3]),
-            r"shape \[3, 6\]; expected .* \[8, 6\]",
+            r"expected .* \[8, 6\], got \[3, 6\]",
         ),
         (lambda: data["entities"]["object"].pop("norm_mat"), "lacks .'norm_mat'"),
         (lambda: data["cameras"].pop("world_mat_7"), "no world_mat_7 .1 of 8"),

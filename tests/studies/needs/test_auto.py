@@ -42,10 +42,7 @@ def test_auto_searches_trains_prunes_and_compresses(tmp_path, monkeypatch):
 
 
 def test_needs_refuses_what_it_does_not_know(tmp_path):
-    for wrong, words in (
-        ({"share": 0.5}, "share.*0.5"),
-        ({"least": -1.0}, "least.*-1"),
-    ):
+    for wrong, words in (({"share": 0.5}, "share.*0.5"), ({"least": -1.0}, "least.*-1")):
         with pytest.raises(HoigsError, match=words):
             hoigs.needs(NAME, out=tmp_path / "answer", **wrong)
     assert not (tmp_path / "answer").exists()

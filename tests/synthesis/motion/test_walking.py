@@ -76,9 +76,7 @@ def test_the_carried_box_stays_clear_of_the_body(body: AnnyBody, carry: Syntheti
     assert inside[:, ~arms].max() < -0.01 and inside[:, arms].max() < 0.01
 
 
-def test_the_box_crosses_the_view_hides_the_body_and_is_hidden_by_it(
-    carry: SyntheticScene,
-) -> None:
+def test_the_box_crosses_the_view_hides_the_body_and_is_hidden_by_it(carry: SyntheticScene) -> None:
     first, hidden, last = (carry.render(f, carry.cameras[f]) for f in (0, 12, 23))
     seen = {v.frame: int(v.mask("object").sum()) for v in (first, hidden, last)}
     assert seen[12] < 0.1 * seen[0] and seen[12] < 0.1 * seen[23], seen

@@ -59,7 +59,6 @@ class LinearDisplacement(DeformationModel):
 
     def velocity(self, canonical: Gaussians, moment: Moment) -> Float[Tensor, "N 3"]:
         """Metres per unit time."""
-        del canonical, moment
         return self.displacement
 
     def regularizers(self) -> dict[str, Tensor]:

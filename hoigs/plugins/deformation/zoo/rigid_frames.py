@@ -32,10 +32,7 @@ class RigidFrames(DeformationModel):
     """
 
     kinds = frozenset({"object"})
-    rates: ClassVar[Mapping[str, str]] = {
-        "corrections.turns": "pose",
-        "corrections.shifts": "pose",
-    }
+    rates: ClassVar[Mapping[str, str]] = {"corrections.turns": "pose", "corrections.shifts": "pose"}
 
     def __init__(self, *, track: ObjectTrack, trained_frames: Sequence[int] | None = None) -> None:
         super().__init__()
@@ -44,7 +41,6 @@ class RigidFrames(DeformationModel):
 
     @classmethod
     def from_config(cls, config: ComponentConfig, context: BuildContext) -> Self:
-        del config
         if context.object_track is None:
             raise ValueError(
                 "deformation:rigid-frames needs a track; it suits entities of kind object"

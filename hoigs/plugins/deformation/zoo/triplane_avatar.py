@@ -31,10 +31,7 @@ from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.human_planes import CanonicalAttributes
 from hoigs.plugins.deformation.skinned_body import SkinnedBodyConfig
-from hoigs.plugins.deformation.surface_body import (
-    OPAQUE,
-    SurfaceBody,
-)
+from hoigs.plugins.deformation.surface_body import OPAQUE, SurfaceBody
 
 # Decoders from a canonical point's features to its Gaussian (ExAvatar, Moon et al. 2024,
 # arXiv:2407.21686; HUGS, Kocabas et al. 2024, arXiv:2311.17910), and their 6D rotations.

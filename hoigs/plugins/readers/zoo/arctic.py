@@ -109,23 +109,14 @@ class ArcticReader(ClipReader):
                 f"{lens.height}: the full images are needed, not cropped_images/"
             )
         cameras = [lens.camera(w2c) for w2c in poses]
-        kinds: dict[str, EntityKind] = (
-            {"human": "human", "object": "object"} if self.config.masks else {}
-        )
+        both: dict[str, EntityKind] = {"human": "human", "object": "object"}
+        kinds = both if self.config.masks else {}
         bodies = {"human": _body(place, subject, frames)} if self.config.masks else {}
         track, angles = _object(place, truth[frames])
-        store = LazyFrames(
-            place.root,
-            PixelFiles(
-                images,
-                masks={n: MaskFiles(paths) for n, paths in masks.items()}
-                if self.config.masks
-                else None,
-            ),
-            cameras,
-            lenses=[lens] * len(frames),
-            cache_mb=self.config.cache_mb,
-        )
+        known = {n: MaskFiles(paths) for n, paths in masks.items()} if self.config.masks else None
+        pixels, lenses = PixelFiles(images, masks=known), [lens] * len(frames)
+        cache = self.config.cache_mb
+        store = LazyFrames(place.root, pixels, cameras, lenses=lenses, cache_mb=cache)
         away = float(cameras[0].to_camera(track.translations)[:, 2].median())
         span = (BEHIND[0] * away, BEHIND[1] * away)
         points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.config.points)

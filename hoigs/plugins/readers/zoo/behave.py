@@ -94,9 +94,8 @@ def read_fits(folder: Path, frames: Sequence[Path], category: str) -> Fits:
         return _of_frames({f: p for f, p in pairs.items() if None not in p})
     body_path, object_path = folder / "smpl_fit_all.npz", folder / "object_fit_all.npz"
     if body_path.is_file() or object_path.is_file():
-        absent = tuple(
-            Need.of(p.name, maker=MAKER) for p in (body_path, object_path) if not p.is_file()
-        )
+        gone = [p.name for p in (body_path, object_path) if not p.is_file()]
+        absent = tuple(Need.of(name, maker=MAKER) for name in gone)
         return _none(frames, absent) if absent else _of_arrays(frames, body_path, object_path)
     needs = []
     for frame in frames:
@@ -139,10 +138,8 @@ def _of_arrays(frames: Sequence[Path], body_path: Path, object_path: Path) -> Fi
     except ValueError as error:
         raise ClipError(f"{body_path.parent}: 30-fps fits: {error}") from error
     widths = {"poses": 156, "trans": 3, "betas": 10}
-    for path, table, keys in (
-        (body_path, body, widths),
-        (object_path, track, {"angles": 3, "trans": 3}),
-    ):
+    of_object = {"angles": 3, "trans": 3}
+    for path, table, keys in ((body_path, body, widths), (object_path, track, of_object)):
         count = len(table.get("frame_times", ()))
         bad = [k for k, w in keys.items() if k not in table or table[k].shape != (count, w)]
         if bad or not count:
@@ -286,9 +283,8 @@ class BehaveReader(ClipReader):
             *(fits.needs if fits else ()),
         ]
         require_files(folder, LAYOUT, needs)
-        kinds: dict[str, EntityKind] = (
-            {"human": "human", "object": "object"} if self.config.masks else {}
-        )
+        both: dict[str, EntityKind] = {"human": "human", "object": "object"}
+        kinds = both if self.config.masks else {}
         bodies, objects = self._tracks(folder, info, fits) if fits else ({}, {})
         view = self._view(folder, info, kept, self.config.kinect)
         span = points_of_depth(view.store, view.cameras, tuple(kinds), self.config.points)
@@ -339,9 +335,8 @@ class BehaveReader(ClipReader):
         return needs
 
     def _view(self, folder: Path, info: SequenceInfo, frames: Sequence[Path], kinect: int) -> _View:
-        calibration = parse_json(
-            folder / info.intrinsic / str(kinect) / "calibration.json", Calibration
-        )
+        path = folder / info.intrinsic / str(kinect) / "calibration.json"
+        calibration = parse_json(path, Calibration)
         pose = parse_json(folder / info.config / str(kinect) / "config.json", KinectPose)
         lens = calibration.color.lens()
         camera = lens.camera(pose.world_to_camera(f"{info.config}/{kinect}/config.json"))
@@ -355,36 +350,29 @@ class BehaveReader(ClipReader):
             depths.append(depth if depth.is_file() else None)
             for name, names in _mask_names(place).items():
                 masks[name].append(_found(folder, *names) if self.config.masks else None)
-        cameras = [camera] * len(frames)
-        store = LazyFrames(
-            folder,
-            PixelFiles(
-                images,
-                masks={n: MaskFiles(paths) for n, paths in masks.items()}
-                if self.config.masks
-                else None,
-                depth=DepthFiles(depths, scale=0.001) if any(depths) else None,
-            ),
-            cameras,
-            lenses=[lens] * len(frames),
-            cache_mb=self.config.cache_mb,
+        cameras, lenses = [camera] * len(frames), [lens] * len(frames)
+        pixels = PixelFiles(
+            images,
+            masks={n: MaskFiles(p) for n, p in masks.items()} if self.config.masks else None,
+            depth=DepthFiles(depths, scale=0.001) if any(depths) else None,
         )
+        store = LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb)
         return _View(store, cameras)
 
     def _others(self, folder: Path, info: SequenceInfo, frames: Sequence[Path]) -> dict[int, _View]:
         """Views of those other Kinects whose files are complete."""
         kinects = [k for k in range(4) if k != self.config.kinect]
-        whole = {
-            k: all(n.found(folder) for n in self._view_needs(info, frames, k)) for k in kinects
+        return {
+            k: self._view(folder, info, frames, k)
+            for k in kinects
+            if all(need.found(folder) for need in self._view_needs(info, frames, k))
         }
-        return {k: self._view(folder, info, frames, k) for k in kinects if whole[k]}
 
     def _tracks(
         self, folder: Path, info: SequenceInfo, fits: Fits
     ) -> tuple[dict[str, BodyTrack], dict[str, ObjectTrack]]:
-        pose = pose_from_smplh(
-            fits.poses, fits.places, same_betas(list(fits.betas), f"{folder}: SMPL+H fits"), "flat"
-        )
+        betas = same_betas(list(fits.betas), f"{folder}: SMPL+H fits")
+        pose = pose_from_smplh(fits.poses, fits.places, betas, "flat")
         subject = next((s for s in GENDERS if s in folder.resolve().name.split("_")), None)
         gender = info.gender or fits.gender or (GENDERS[subject] if subject else None)
         source = f"{fits.source}; SMPL+H"

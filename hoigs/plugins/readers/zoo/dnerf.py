@@ -30,8 +30,7 @@ class DnerfConfig(ReaderConfig):
     """Settings of reader:dnerf."""
 
     background: Literal["white", "black"] = Field(
-        default="black",
-        description="colour of transparent pixels and of renders",
+        default="black", description="colour of transparent pixels and of renders"
     )
     points: int = Field(
         default=2000, ge=1, description="random points to start from where no file has any (4DGS)"
@@ -88,15 +87,10 @@ class DnerfReader(ClipReader):
         }
         times = [frame.time for _, _, frame in rows if frame.time is not None]
         points, colors, origin = self._points(folder)
+        pixels = PixelFiles(images, background=COLORS[self.config.background])
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                PixelFiles(images, background=COLORS[self.config.background]),
-                cameras,
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb),
             cameras=cameras,
             moments=timed_moments(times, split["train"]),
             points=points,

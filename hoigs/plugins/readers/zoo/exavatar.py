@@ -207,9 +207,8 @@ def background_points(folder: Path) -> tuple[*Points, str]:
     try:
         rows = np.loadtxt(path, ndmin=2)
     except (OSError, ValueError) as error:
-        raise ClipError(
-            f"{path} cannot be read ({error}); expected lines of x y z r g b"
-        ) from error
+        why = f"{path} cannot be read ({error}); expected lines of x y z r g b"
+        raise ClipError(why) from error
     if rows.shape[1] != 6 or not len(rows):
         raise ClipError(f"{path} has shape {list(rows.shape)}, expected lines of x y z r g b")
     values = torch.from_numpy(rows).float()
@@ -289,15 +288,11 @@ class ExavatarReader(ClipReader):
         }
         if not bodies:
             provenance["poses of human"] = NO_POSES
+        masks = MaskFiles([files.masks[n] for n in numbers])
+        pixels = PixelFiles(images, masks={"human": masks})
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                PixelFiles(images, masks={"human": MaskFiles([files.masks[n] for n in numbers])}),
-                cameras,
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb),
             cameras=cameras,
             moments=video_moments(indices, indices[-1] + 1, bodies),
             kinds={"human": "human"},
@@ -319,9 +314,8 @@ class ExavatarReader(ClipReader):
         if self.config.smplx is None and not still:
             return {}
         path = folder / OPTIMIZED / "shape_param.json"
-        betas = torch.from_numpy(
-            numbers(load_json(path), str(path), flat=True)[: self.config.num_betas]
-        )
+        shape = numbers(load_json(path), str(path), flat=True)
+        betas = torch.from_numpy(shape[: self.config.num_betas])
         pelvis = torch.zeros(3, dtype=torch.float64)
         if self.config.smplx is not None:
             body = body_model("body:smplx", self.config.smplx, num_betas=len(betas))

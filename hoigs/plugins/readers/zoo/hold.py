@@ -19,7 +19,7 @@ from hoigs.core.system.unpickling import load_pickled_npy
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, ObjectTrack, uniform_test_split
 from hoigs.core.values.tokens import EntityKind
-from hoigs.plugins.readers.checked_files import Need, VideoPointsConfig, require_files
+from hoigs.plugins.readers.checked_files import Need, VideoPointsConfig, numbers, require_files
 from hoigs.plugins.readers.lazy_frames import (
     LazyFrames,
     MaskFiles,
@@ -84,13 +84,11 @@ class HoldReader(ClipReader):
         hands = [h for h in ("right", "left") if h in data["entities"]]
         kinds: dict[str, EntityKind] = {f"hand_{h}": "human" for h in hands}
         kinds["object"] = "object"
-        masks = {
-            n: MaskFiles(paths, partial(_marked, VALUES[n.removeprefix("hand_")])) for n in kinds
-        }
+        values = {n: VALUES[n.removeprefix("hand_")] for n in kinds}
+        masks = {n: MaskFiles(paths, partial(_marked, value)) for n, value in values.items()}
         track = _object(data["entities"].get("object"), len(images), where)
-        store = LazyFrames(
-            build, PixelFiles(images, masks=masks), cameras, cache_mb=self.config.cache_mb
-        )
+        pixels = PixelFiles(images, masks=masks)
+        store = LazyFrames(build, pixels, cameras, cache_mb=self.config.cache_mb)
         away = float(cameras[0].to_camera(track.translations)[:, 2].median())
         span = (NEAREST * away, FARTHEST * away)
         points, colors = points_along_rays(store, cameras, tuple(kinds), span, self.config.points)
@@ -127,9 +125,7 @@ def _cameras(table: Any, images: Sequence[Path], where: str) -> list[Camera]:
     cameras = []
     for i, image in enumerate(images):
         name = f"world_mat_{i}"
-        K, w2c = decomposed(
-            _numbers(table[name], (None, 4), f"{where}: {name}")[:3], f"{where}: {i}"
-        )
+        K, w2c = decomposed(numbers(table[name], f"{where}: {name}", -1, 4)[:3], f"{where}: {i}")
         width, height = image_size(image)
         lens, pose = torch.from_numpy(K).float(), torch.from_numpy(w2c).float()
         cameras.append(Camera(lens, pose, width, height))
@@ -166,13 +162,15 @@ def _object(table: Any, frames: int, where: str) -> ObjectTrack:
     found = set(table) if isinstance(table, dict) else set()
     if not keys <= found:
         raise ClipError(f"{where}: entities.object lacks {sorted(keys - found)}")
-    poses = _numbers(table["object_poses"], (frames, 6), f"{where}: object_poses")
-    cano = _numbers(table["pts.cano"], (None, 3), f"{where}: pts.cano")
-    norm = _numbers(table["norm_mat"], (4, 4), f"{where}: norm_mat")
+    poses = numbers(table["object_poses"], f"{where}: object_poses", frames, 6)
+    cano = numbers(table["pts.cano"], f"{where}: pts.cano", -1, 3)
+    norm = numbers(table["norm_mat"], f"{where}: norm_mat", 4, 4)
+    if not len(cano):
+        raise ClipError(f"{where}: pts.cano has no points")
     if np.linalg.matrix_rank(norm) < 4:
         raise ClipError(f"{where}: norm_mat has no inverse")
     back = np.linalg.inv(norm)
-    scale = float(_numbers(np.reshape(table["obj_scale"], -1), (None,), f"{where}: obj_scale")[0])
+    scale = float(numbers(np.reshape(table["obj_scale"], -1)[:1], f"{where}: obj_scale", 1)[0])
     points = scale * (cano @ back[:3, :3].T + back[:3, 3])
     center = points.mean(0)
     rotations = axis_angle_to_matrices(torch.from_numpy(poses[:, :3]))
@@ -186,22 +184,6 @@ def _object(table: Any, frames: int, where: str) -> ObjectTrack:
         observed=torch.ones(frames, dtype=torch.bool),
         provenance="HOLD's SfM on the masked object, aligned with the hand",
     )
-
-
-def _numbers(value: Any, shape: tuple[int | None, ...], where: str) -> Float[np.ndarray, "..."]:
-    """Finite numbers of a shape, None for any length of at least 1; errors say what came."""
-    expected = f"expected finite numbers of shape {list(shape)}".replace("None", "any")
-    try:
-        found = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
-        raise ClipError(f"{where} is not numbers ({error}); {expected}") from error
-    fits = found.ndim == len(shape) and all(
-        n == m or (m is None and n) for n, m in zip(found.shape, shape, strict=True)
-    )
-    if not fits or not np.isfinite(found).all():
-        what = f"has shape {list(found.shape)}" if not fits else "has numbers that are not finite"
-        raise ClipError(f"{where} {what}; {expected}")
-    return found
 
 
 def _require_values(path: Path) -> None:

@@ -100,23 +100,15 @@ class HosnerfReader(ClipReader):
             own = [folder / OBJECT_MASKS / f"{p.stem}.png" for p in images]
             masks["object"] = MaskFiles(own, _any)
         cameras = [lens.camera(w2c) for lens, w2c in zip(rig.lenses, rig.world_to_camera)]
-        store: FrameStore = LazyFrames(
-            folder,
-            PixelFiles(images, masks=masks),
-            cameras,
-            lenses=rig.lenses,
-            cache_mb=self.config.cache_mb,
-        )
+        pixels, cache = PixelFiles(images, masks=masks), self.config.cache_mb
+        store: FrameStore = LazyFrames(folder, pixels, cameras, lenses=rig.lenses, cache_mb=cache)
         if "object" in kinds:
             store = _ObjectRemoved(store)
-        bodies = (
-            {}
-            if self.config.smpl is None
-            else {"human": _body(folder, images, rig, self.config.smpl)}
-        )
-        points, colors = points_along_rays(
-            store, cameras, tuple(kinds), rig.span, self.config.points
-        )
+        bodies = {}
+        if self.config.smpl is not None:
+            bodies["human"] = _body(folder, images, rig, self.config.smpl)
+        count = self.config.points
+        points, colors = points_along_rays(store, cameras, tuple(kinds), rig.span, count)
         provenance: dict[str, Any] = {
             "reader": "reader:hosnerf",
             "cameras": f"cameras.pkl, by name; COLMAP's world divided by {rig.scale:.6g}: metres",

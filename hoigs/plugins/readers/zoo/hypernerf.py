@@ -140,19 +140,14 @@ class HypernerfReader(ClipReader):
         seen = _optional(folder, "covisible/*x/val", ids, ".png")
         points, colors, origin = _points(folder, scene)
         last = max(1, *(metadata[name].step for name in ids))
+        pixels = PixelFiles(
+            images,
+            ignored=MaskFiles(seen, dark) if any(seen) else None,
+            depth=DepthFiles(depths, scene.scale) if any(depths) else None,
+        )
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                PixelFiles(
-                    images,
-                    ignored=MaskFiles(seen, dark) if any(seen) else None,
-                    depth=DepthFiles(depths, scene.scale) if any(depths) else None,
-                ),
-                cameras,
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb),
             cameras=cameras,
             moments=[Moment(metadata[n].step / last, metadata[n].step) for n in ids],
             points=points,

@@ -112,19 +112,14 @@ class NeumanReader(ClipReader):
         }
         if not bodies:
             provenance["poses of human"] = NO_POSES
+        pixels = PixelFiles(
+            [files[name] for name in names],
+            masks={"human": MaskFiles(masks, dark)},
+            depth=DepthFiles(depth, 1 / unit, read_mvs_depth) if any(depth) else None,
+        )
         return Clip(
             name=folder.resolve().name,
-            store=LazyFrames(
-                folder,
-                PixelFiles(
-                    [files[name] for name in names],
-                    masks={"human": MaskFiles(masks, dark)},
-                    depth=DepthFiles(depth, 1 / unit, read_mvs_depth) if any(depth) else None,
-                ),
-                cameras,
-                lenses=lenses,
-                cache_mb=self.config.cache_mb,
-            ),
+            store=LazyFrames(folder, pixels, cameras, lenses=lenses, cache_mb=self.config.cache_mb),
             cameras=cameras,
             moments=video_moments([order[name] for name in names], len(files), bodies),
             kinds={"human": "human"},

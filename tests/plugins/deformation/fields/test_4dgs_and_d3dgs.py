@@ -50,10 +50,7 @@ def test_4dgs_lets_gradients_through_its_lookup_and_d3dgs_does_not():
 
 
 def test_the_static_stage():
-    for model in (
-        planes(start=0.2),
-        mlp(start=0.2, zero_heads=False),
-    ):
+    for model in (planes(start=0.2), mlp(start=0.2, zero_heads=False)):
         entity = perturbed(model, cloud())
         assert not torch.equal(entity(Moment(0.5)).means, entity.means)  # a finished model moves
         model.set_progress(0.19)

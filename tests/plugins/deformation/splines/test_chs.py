@@ -13,7 +13,6 @@ from hoigs.core.model.entity import Entity
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.chs import CubicHermite, CubicHermiteConfig
 
@@ -128,13 +127,6 @@ def test_sign_of_keyframe_quats_does_not_matter():  # F4
         torch.testing.assert_close(a, b, atol=1e-5, rtol=0)
 
 
-def test_residual_is_added_in_the_world():
-    entity = Entity(cloud(), CubicHermite(CubicHermiteConfig(keyframes=3)))
-    shift = torch.randn(10, 3)
-    moved = entity(Moment(0.2), Residual(means=shift)).means
-    torch.testing.assert_close(moved, entity(Moment(0.2)).means + shift)
-
-
 @pytest.mark.parametrize("tangents", ["learned", "finite-difference"])
 def test_every_parameter_learns(tangents):
     entity = Entity(cloud(), CubicHermite(CubicHermiteConfig(keyframes=3, tangents=tangents)))
@@ -220,15 +212,6 @@ def test_rows_stay_together_and_children_turn_with_the_object():
         expected = canonical.means @ track.rotations[frame].mT + track.translations[frame]
         got = entity(Moment(frame / 16)).means
         torch.testing.assert_close(got, expected, atol=2e-3, rtol=0)
-
-
-def test_resize_then_load_restores():
-    source = Entity(cloud(10), CubicHermite(CubicHermiteConfig(keyframes=3)))
-    perturbed(source.deformation)
-    target = Entity(cloud(4), CubicHermite(CubicHermiteConfig(keyframes=3)))
-    target.resize(10)
-    target.load_state_dict(source.state_dict())
-    torch.testing.assert_close(source(Moment(0.3)).means, target(Moment(0.3)).means)
 
 
 def test_regularizers_by_hand():

@@ -13,7 +13,6 @@ from hoigs.core.model.entity import Entity
 from hoigs.core.values.clip import ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
-from hoigs.core.values.tokens import Residual
 from hoigs.core.values.topology import TopologyChange
 from hoigs.plugins.deformation.chs import CubicHermite
 from hoigs.plugins.deformation.tracked_chs import (
@@ -129,13 +128,6 @@ def test_the_shape_is_learned_from_all_frames():
         entity.means.grad = None
         entity(Moment(time)).means.square().sum().backward()
         assert (entity.means.grad.abs().sum(-1) > 0).all()
-
-
-def test_residual_is_added_in_the_world():
-    entity = entity_of(jittering_track(), perturb=0.3)
-    shift = torch.randn(10, 3, dtype=torch.float64)
-    moved = entity(Moment(0.2), Residual(means=shift)).means
-    torch.testing.assert_close(moved, entity(Moment(0.2)).means + shift)
 
 
 def test_departures_from_a_rigid_motion_are_penalised():
