@@ -195,6 +195,56 @@ def gswarp(gaussians: Gaussians, camera: Camera) -> Round:
     return differentiated(draw)(gaussians, camera)
 
 
+def faster_gs(gaussians: Gaussians, camera: Camera) -> Round:
+    """FasterGSCudaBackend of nerficg-project/faster-gaussian-splatting, built from its source."""
+    if gaussians.means.device.type != "cuda":
+        raise NotMeasuredError("its kernels need CUDA")
+    if importlib.util.find_spec("FasterGSCudaBackend") is None:
+        raise NotMeasuredError("not installed: it is built from its repository")
+    from FasterGSCudaBackend.torch_bindings import RasterizerSettings, diff_rasterize
+
+    device, request = gaussians.means.device, RenderRequest()
+    fx, fy, cx, cy = (float(camera.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    settings = RasterizerSettings(
+        camera.world_to_camera.contiguous(),
+        camera.center.contiguous(),
+        torch.zeros(3, device=device),
+        (gaussians.sh_degree + 1) ** 2,
+        camera.width,
+        camera.height,
+        fx,
+        fy,
+        cx,
+        cy,
+        request.near,
+        1e3,
+        False,
+    )
+
+    # its own leaves: slices of ours would not be contiguous, and their gradients be copied
+    leaves = [
+        part.detach().contiguous().requires_grad_()
+        for part in (
+            gaussians.means,
+            gaussians.log_scales,
+            gaussians.quats,
+            gaussians.opacity_logits[:, None],
+            gaussians.sh[:, :1],
+            gaussians.sh[:, 1:],
+        )
+    ]
+    upstream = torch.rand(3, camera.height, camera.width, device=device)
+    kept: list[Tensor] = []
+
+    def forward() -> Tensor:
+        for leaf in leaves:
+            leaf.grad = None
+        kept[:] = [diff_rasterize(*leaves, torch.empty(0, device=device), settings)]
+        return kept[0].detach().permute(1, 2, 0)
+
+    return Round(forward, lambda: kept.pop().backward(upstream))
+
+
 def _versions(*packages: str) -> dict[str, str]:
     found = {}
     for package in packages:
@@ -224,6 +274,7 @@ def all_peers() -> dict[str, Callable[[], Peer]]:
             "gsplat-torch", gsplat_torch.prepare, gsplat_torch.NOTE, _versions("gsplat")
         ),
         "gsplat": lambda: Peer("gsplat", gsplat, "CUDA kernels", _versions("gsplat")),
+        "faster-gs": lambda: Peer("faster-gs", faster_gs, "gradients from colour alone"),
         "gswarp": lambda: Peer(
             "gswarp", gswarp, "gradients from colour alone", _versions("gswarp")
         ),

@@ -15,7 +15,6 @@ from hoigs.core.registry.component import INTERFACES, KINDS, Component, missing_
 from hoigs.core.registry.import_watch import limited, traceback_tail
 from hoigs.core.registry.manager import Offer, PluginManager, Status, describe, normal_name
 from hoigs.core.system.environments import ManagedEnvironment
-from hoigs.core.system.xfeat import ENVIRONMENT as XFEAT
 
 
 class UsesComponents(Protocol):
@@ -225,7 +224,7 @@ def default_registry(plugin_files: Iterable[str | Path] = ()) -> Registry:
     return registry
 
 
-# The environments that the installed estimators name, and that of the features of cameras.
+# The environments that the installed estimators name.
 
 
 def known_environments(registry: Registry | None = None) -> dict[str, ManagedEnvironment]:
@@ -239,7 +238,7 @@ def known_environments(registry: Registry | None = None) -> dict[str, ManagedEnv
             continue
         if environment is not None:
             found[environment.name] = environment
-    return found | {XFEAT.name: XFEAT}
+    return found
 
 
 def environment_named(name: str, registry: Registry | None = None) -> ManagedEnvironment:

@@ -107,19 +107,12 @@ class ManagedEnvironment:
         Raises:
             EnvironmentAbsentError: it is not installed.
         """
-        return _python_of(self._whole())
-
-    def packages(self) -> Path:
-        """The folder of its packages; raises as `python` does."""
-        return _site_packages(self._whole())
-
-    def _whole(self) -> Path:
         if not self.installed:
             raise EnvironmentAbsentError(
                 f"the environment {self.name} is not installed ({self.summary}); run "
                 f"`hoigs estimators install {self.name}`, or the same command with --yes"
             )
-        return self.folder
+        return _python_of(self.folder)
 
     def lacking(self) -> dict[str, str]:
         """Files that could not be had, and why."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,7 @@ import numpy as np
 from PIL import Image
 
 from hoigs.core.reporting import ranges
-from hoigs.core.system.xfeat import ENVIRONMENT
 from hoigs.core.values.lens import Lens
-from hoigs.preparation.cameras import learned_features
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
 from hoigs.preparation.cameras.turning_cameras import grown, quiet_colmap
 from hoigs.preparation.estimates.reader import GivenMasks
@@ -63,6 +61,7 @@ def structure_from_motion(
     from hoigs.core.system.colmap import pycolmap
 
     report = progress or (lambda _done: None)
+    images, features = folder / "images", folder / "features.db"
     for name in ("images", "masks", "models", "largest"):  # cheap, or half-made
         shutil.rmtree(folder / name, ignore_errors=True)
     _write_images(video, masks, folder, lambda done: report(0.1 * done))
@@ -71,20 +70,29 @@ def structure_from_motion(
         lens = lens.resized(video.width, video.height)
         focal = float(lens.K[0, 0])
     tried = (focal,) if focal else tuple(share * longer for share in (ASSUMED_FOCAL, *FURTHER))
-    best, count, enough = None, 0, SMALLEST_SHARE * len(video)
+    best, count = None, 0
     with quiet_colmap():
-        for found in _attempts(pycolmap, video, masks, folder, tried, lens, report):
+        if not features.is_file():
+            _extract(pycolmap, features, images, _reader(pycolmap, video, folder, tried[0], lens))
+        for number, length in enumerate(tried):
+            begun = 0.4 + 0.6 * number / len(tried)
+            report(begun)
+            matches = folder / f"matches-{number}.db"
+            if not matches.is_file():
+                _match(pycolmap, features, matches, None if lens else length)
+            report(begun + 0.3 / len(tried))
+            found = _mapped(pycolmap, matches, images, folder / "models" / str(number), lens)
             if found is not None and found.num_reg_images() > count:
                 best, count = found, found.num_reg_images()
-            if count >= enough:
+            if count >= SMALLEST_SHARE * len(video):
                 break
-    if best is None or count < enough:
+    if best is None or count < SMALLEST_SHARE * len(video):
         lengths = ", ".join(f"{length:.0f}" for length in tried)
         raise SourceError(
             f"structure from motion gave cameras to {count} of {len(video)} frames, with focal "
             f"lengths of {lengths} px to start from. {_what_to_do(best, video)}if the camera "
             "stands still, use --camera static, and if it hardly changes its place, as in a hand, "
-            f"--camera turning; {_not_installed()}if you know the lens, give --focal or "
+            "--camera turning; if you know the lens, give --focal or "
             "--calibration; else the background may lack texture, be blurred or be hidden by the "
             "masks: look at the masks, take sharper or more frames, or put a COLMAP model of your "
             "own beside the video, as sparse/"
@@ -94,47 +102,6 @@ def structure_from_motion(
     best.write(kept)
     report(1.0)
     return kept
-
-
-def _attempts(
-    pycolmap: Any,
-    video: Frames,
-    masks: GivenMasks,
-    folder: Path,
-    tried: tuple[float, ...],
-    lens: Lens | None,
-    report: Callable[[float], None],
-) -> Iterator[Any]:
-    """Reconstructions by SIFT's features, one for each focal length, and then, if they are
-    installed, by learned ones; None where there is none."""
-    images, features, learned = folder / "images", folder / "features.db", folder / "learned.db"
-    if not features.is_file():
-        _extract(pycolmap, features, images, _reader(pycolmap, video, folder, tried[0], lens))
-    extract = learned_features.installed()
-    ends = np.linspace(0.4, 1.0 if extract is None else 0.7, len(tried) + 1)
-    for number, length in enumerate(tried):
-        report(float(ends[number]))
-        matches = folder / f"matches-{number}.db"
-        if not matches.is_file():
-            half = _of_length(pycolmap, features, matches, None if lens else length)
-            _match(pycolmap, half)
-            half.replace(matches)
-        report(float(ends[number : number + 2].mean()))
-        yield _mapped(pycolmap, matches, images, folder / "models" / str(number), lens)
-    if extract is None:
-        return
-    if not learned.is_file():
-        half = _copy(features, learned)
-        learned_features.write_matches(
-            pycolmap, half, video, masks, extract, lambda done: report(0.7 + 0.1 * done)
-        )
-        half.replace(learned)
-    ends = np.linspace(0.8, 1.0, len(tried) + 1)
-    for number, length in enumerate(tried):
-        report(float(ends[number]))
-        half = _of_length(pycolmap, learned, learned, None if lens else length)
-        learned_features.verify(pycolmap, half, video)
-        yield _mapped(pycolmap, half, images, folder / "models" / f"learned-{number}", lens)
 
 
 def _write_images(
@@ -165,34 +132,30 @@ def _extract(pycolmap: Any, features: Path, images: Path, reader: Any) -> None:
     half.replace(features)
 
 
-def _of_length(pycolmap: Any, source: Path, target: Path, focal: float | None) -> Path:
-    """A temporary copy for `target`, whose cameras have that focal length (None: their own)."""
-    half = _copy(source, target)
+def _match(pycolmap: Any, features: Path, matches: Path, focal: float | None) -> None:
+    """A database with features, and matches that hold for a focal length (None: that of the
+    database), likewise."""
+    half = _copy(features, matches)
     database = pycolmap.Database.open(half)
     for camera in database.read_all_cameras():
         if focal is not None:
             camera.focal_length = focal
             database.update_camera(camera)
     database.close()
-    return half
-
-
-def _match(pycolmap: Any, database: Path) -> None:
-    """Matches frames with their neighbours in time, and verifies the matches."""
     pycolmap.match_sequential(
-        database,
+        half,
         matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads()),
         pairing_options=pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True),
         device=pycolmap.Device.cpu,
     )
+    half.replace(matches)
 
 
 def _mapped(pycolmap: Any, matches: Path, images: Path, folder: Path, lens: Lens | None) -> Any:
     """The reconstruction with the most cameras, or None."""
     folder.mkdir(parents=True)
-    options = _mapping(pycolmap, lens is not None)
     models = pycolmap.incremental_mapping(
-        _copy(matches, folder / "matches.db"), images, folder, options=options
+        _copy(matches), images, folder, options=_mapping(pycolmap, lens is not None)
     )
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
 
@@ -215,27 +178,21 @@ def _what_to_do(model: Any, video: Frames) -> str:
         f"; --start {longest[0]}f --end {longest[-1] + 1}f uses the longest part of them, "
         f"{seconds:.1f} s"
     )
-    long = part if seconds >= SHORTEST else ""
-    return f"Frames {ranges(known)} of the video have one{long}. To have more: "
-
-
-def _not_installed() -> str:
-    """How to have learned features, where SIFT's alone were tried."""
-    if ENVIRONMENT.installed:
-        return ""
     return (
-        f"`hoigs estimators install {ENVIRONMENT.name}` ({ENVIRONMENT.summary}) adds features that "
-        "a network finds, which are tried when these fail; "
+        f"Frames {ranges(known)} of the video have one{part * (seconds >= SHORTEST)}. "
+        "To have more: "
     )
 
 
-def _copy(database: Path | None, name: Path) -> Path:
-    """A temporary database for `name`: a copy of another one, or none yet.
+def _copy(database: Path | None, name: Path | None = None) -> Path:
+    """A temporary database for `name`, or beside `database`: a copy of it, or none yet.
 
     What a killed run left of it goes, with SQLite's own files beside it.
     """
-    half = name.with_suffix(".part")
-    for path in name.parent.glob(f"{half.name}*"):
+    target = name or database
+    assert target is not None
+    half = target.with_suffix(".part")
+    for path in target.parent.glob(f"{half.name}*"):
         path.unlink()
     if database is not None:
         shutil.copyfile(database, half)

@@ -14,7 +14,6 @@ from PIL import Image
 from scipy import ndimage
 
 from hoigs.preparation.body.landmarks import Landmarks
-from hoigs.preparation.cameras import learned_features, sfm
 from hoigs.preparation.cameras.choose import BesideVideo, ChosenCameras, choose_cameras
 from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import background_motion
@@ -222,50 +221,6 @@ def test_frames_without_features_are_refused_with_advice(tmp_path: Path) -> None
     empty = GivenMasks(together=MaskStack([np.zeros((HEIGHT, WIDTH), bool)] * 4))
     with pytest.raises(SourceError, match=r"0 of 4 .*--camera static"):
         cameras_of(video, empty, tmp_path, camera="moving")
-
-
-def sift(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """In place of a network's features."""
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False)
-    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    points, found = extractor.extract_from_uint8_array(np.ascontiguousarray(image[..., 0]))
-    descriptors = np.asarray(found.data, np.float32)
-    unit = descriptors / np.linalg.norm(descriptors, axis=-1, keepdims=True)
-    return np.array([(p.x, p.y) for p in points]), unit
-
-
-def test_learned_features_where_sift_finds_no_way(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    video, masks = recorded(tmp_path / "moves", [0.1 * i for i in range(COUNT)])
-    monkeypatch.setattr(sfm, "_match", lambda *_: None)
-    monkeypatch.setattr(learned_features, "installed", lambda: None)
-    with pytest.raises(SourceError, match=r"0 of 8 .*hoigs estimators install xfeat"):
-        structure_from_motion(video, masks, tmp_path / "work", focal=FOCAL)
-    monkeypatch.setattr(learned_features, "installed", lambda: sift)
-    done: list[float] = []
-    found = pycolmap.Reconstruction(
-        structure_from_motion(video, masks, tmp_path / "work", focal=FOCAL, progress=done.append)
-    )
-    assert found.num_reg_images() == COUNT and done == sorted(done)
-    assert found.compute_mean_reprojection_error() < 1
-    left = [p for i, m in enumerate(masks.moving(i) for i in range(COUNT))
-            for p in _inside(found, f"{i:05d}.png", m)]  # fmt: skip
-    assert not left, "features of what moves were used"
-
-
-def _inside(model: pycolmap.Reconstruction, name: str, mask: np.ndarray) -> list[np.ndarray]:
-    (image,) = [i for i in model.images.values() if i.name == name]
-    points = [np.asarray(p.xy) for p in image.points2D]
-    return [xy for xy in points if mask[int(xy[1]), int(xy[0])]]
-
-
-def test_features_are_matched_if_each_is_the_others_nearest() -> None:
-    one = np.eye(4, 8, dtype=np.float32)
-    two = one[[2, 0, 1, 3]].copy()
-    two[3] = np.roll(two[3], 4)  # unlike all
-    np.testing.assert_array_equal(learned_features.mutual(one, two), [(0, 1), (1, 2), (2, 0)])
-    assert learned_features.mutual(one, two[:0]).shape == (0, 2)
 
 
 def test_features_and_matches_survive_a_kill(
