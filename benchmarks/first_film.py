@@ -37,7 +37,7 @@ TYPED = {
 
 
 def require_in_readme() -> None:
-    """Raises SystemExit where a command is not a line of the README, so that this is what it says."""
+    """Raises SystemExit where a command is not a line of the README."""
     lines = [line.partition("#")[0].rstrip() for line in (ROOT / "README.md").open()]
     missing = [command for command in TYPED if command not in lines]
     if missing:

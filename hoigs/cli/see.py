@@ -37,7 +37,7 @@ def view(
 def render(
     run: Annotated[Path, typer.Argument(help="Run folder.")], *, options: RenderOptions
 ) -> None:
-    """Render a run to a video, and print the frame rate."""
+    """Make a film of a run: from the video's camera, around the person, or with time frozen."""
     from hoigs.viewing.films import render as draw
 
     with Display() as show:
