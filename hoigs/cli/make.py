@@ -82,7 +82,7 @@ def prepare(
             raise
         rest = f"{stop}; the same command continues: {work_folder(out)} keeps what is done"
         raise Interrupted(rest, stop.code - 128) from stop
-    print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
+    print_table(f"prepared {out}", ("what", "value", "note"), report.rows(), widest=120)
     for warning in report.warnings:
         typer.echo(printable(f"- {warning}"))
     typer.echo(f"clip: {out}")
