@@ -32,7 +32,7 @@ TYPED = {
     "hoigs train clips/mine --out runs/mine": ("runs/mine", "runs/mine/report.html"),
     "hoigs render runs/mine --path bullet-time": ("runs/mine/renders/bullet-time.mp4",),
     "hoigs view runs/mine --html page.html": ("page.html",),
-    "hoigs export runs/mine --format ply": ("runs/mine/exports/ply.ply",),
+    "hoigs export runs/mine --format ply": ("runs/mine/exports/ply",),
 }
 
 
@@ -45,6 +45,8 @@ def require_in_readme() -> None:
 
 
 def megabytes(path: Path) -> float:
+    if not path.exists():
+        raise SystemExit(f"{path} was not made")
     files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
     return round(sum(p.stat().st_size for p in files) / 1e6, 1)
 

@@ -191,7 +191,7 @@ def require_folder(folder: Path) -> None:
         )
     if not folder.is_dir():
         raise ClipError(
-            f"{folder}: no such folder{did_you_mean_beside(folder, 'clip.json')}; "
+            f"{folder}: no such folder{did_you_mean_beside(folder, 'clip.json')} "
             f"`hoigs prepare VIDEO --out {folder}` makes one"
         )
 

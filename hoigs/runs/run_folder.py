@@ -226,7 +226,7 @@ class RunFolder:
         missing = RUN.missing(self.path)
         if missing and not self.path.exists():
             raise HoigsError(
-                f"{self.path}: no such folder{did_you_mean_beside(self.path, 'spec.yaml')}; "
+                f"{self.path}: no such folder{did_you_mean_beside(self.path, 'spec.yaml')} "
                 f"`hoigs train CLIP --out {self.path}` makes one"
             )
         if missing and (self.path / "clip.json").is_file():

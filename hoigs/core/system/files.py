@@ -231,9 +231,9 @@ def printable(text: str) -> str:
 
 def did_you_mean_beside(path: Path, holds: str) -> str:
     """`; did you mean "runs/mine"?` of a path that does not exist, with the folder beside it that
-    has the nearest name and a file `holds` in it, or ""."""
+    has the nearest name and a file `holds` in it, or ";"."""
     with suppress(OSError):
         names = [p.name for p in path.parent.iterdir() if (p / holds).is_file()]
         near = difflib.get_close_matches(path.name, names, n=1, cutoff=0.6)
-        return f'; did you mean "{path.with_name(near[0])}"?' if near else ""
-    return ""
+        return f'; did you mean "{path.with_name(near[0])}"?' if near else ";"
+    return ";"
