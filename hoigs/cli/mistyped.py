@@ -39,7 +39,7 @@ def settings_of(command: str) -> dict[str, str]:
 
 def name_setting(error: Any) -> None:
     """Let a click error about an unknown option name the setting that is meant, if one is."""
-    option, context = getattr(error, "option_name", None), getattr(error, "ctx", None)
+    option, context = str(getattr(error, "option_name", "")), getattr(error, "ctx", None)
     if type(error).__name__ != "NoSuchOption" or context is None:
         return
     word = option.removeprefix("--").replace("-", "_")
