@@ -9,6 +9,8 @@ import typer
 from hoigs import __version__
 from hoigs.cli import common, doctor, make, parts, see, study, train
 from hoigs.cli.failures import GuardedGroup, failures_as_messages
+from hoigs.cli.mistyped import COMMANDS, name_setting
+from hoigs.core.errors import HoigsError
 from hoigs.core.system.threads import keep_freed_memory, share_processors, short_waits_when_busy
 from hoigs.plugins.builtin import PARTS as BUILT_IN
 
@@ -25,6 +27,18 @@ class Root(GuardedGroup):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         ours = [word for word in args if word in SAID_ANYWHERE]
         return super().parse_args(ctx, ours + [w for w in args if w not in SAID_ANYWHERE])
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in self.commands and args[0] in COMMANDS:
+            raise HoigsError(f"{args[0]}: no such command; {COMMANDS[args[0]]}")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            name_setting(error)
+            raise
 
 
 app = typer.Typer(

@@ -12,6 +12,7 @@ import typer
 
 from hoigs.cli.common import Display, print_summary, print_table, say, with_json
 from hoigs.cli.options import flags
+from hoigs.core.errors import Interrupted
 from hoigs.core.system.files import printable
 from hoigs.preparation.options import PrepareOptions
 from hoigs.training.options import DemoOptions, RefineOptions
@@ -56,7 +57,7 @@ def prepare(
     *,
     options: PrepareOptions,
 ) -> None:
-    """Make a clip folder from a video with the given estimators, and a report."""
+    """Turn a video into a clip: a folder with cameras, masks, body, objects, and a report."""
     from hoigs.preparation.prepare import prepare as run
     from hoigs.preparation.prepare import prepare_until, work_folder
 
@@ -69,12 +70,18 @@ def prepare(
         rows = [(name, f"{value:.1f} s") for name, value in seconds.items()]
         print_table(f"stages kept in {work_folder(out)}", ("stage", "made in"), rows)
         return
-    with Display() as show:
-        report = run(
-            source, out, options=options, consent=_consent(), announce=_announce,
-            progress=show.fraction,
-        )  # fmt: skip
-    print_table(f"prepared {out}", ("what", "value", "note"), report.rows())
+    try:
+        with Display() as show:
+            report = run(
+                source, out, options=options, consent=_consent(), announce=_announce,
+                progress=show.fraction,
+            )  # fmt: skip
+    except Interrupted as stop:
+        if not work_folder(out).is_dir():
+            raise
+        rest = f"{stop}; the same command continues: {work_folder(out)} keeps what is done"
+        raise Interrupted(rest, stop.code - 128) from stop
+    print_table(f"prepared {out}", ("what", "value", "note"), report.rows(), widest=120)
     for warning in report.warnings:
         typer.echo(printable(f"- {warning}"))
     typer.echo(f"clip: {out}")

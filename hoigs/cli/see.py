@@ -24,7 +24,8 @@ def view(
     options: ViewOptions,
 ) -> None:
     """Look at a run from any side while it moves; of one in training, at its checkpoints."""
-    say(f"starting the viewer of {' and '.join(str(w) for w in (what, second) if w)} …")
+    doing = "starting the viewer" if options.html is None else f"writing {options.html}, a player"
+    say(f"{doing} of {' and '.join(str(w) for w in (what, second) if w)} …")
     from hoigs.viewing.view import view as show
 
     with Display() as display:
@@ -37,7 +38,7 @@ def view(
 def render(
     run: Annotated[Path, typer.Argument(help="Run folder.")], *, options: RenderOptions
 ) -> None:
-    """Render a run to a video, and print the frame rate."""
+    """Make a film of a run: from the video's camera, around the person, or with time frozen."""
     from hoigs.viewing.films import render as draw
 
     with Display() as show:

@@ -16,6 +16,7 @@ from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.reader import ClipReader
 from hoigs.core.model.standing import in_known_world
 from hoigs.core.registry.registry import Registry, default_registry
+from hoigs.core.system.files import did_you_mean_beside
 from hoigs.core.system.urls import local_path
 from hoigs.core.values.clip import Clip
 from hoigs.runs.choices import parse_settings, validated
@@ -189,7 +190,10 @@ def require_folder(folder: Path) -> None:
             f"`hoigs prepare {folder} --out clips/{folder.stem}` makes a clip of it"
         )
     if not folder.is_dir():
-        raise ClipError(f"{folder}: no such folder; `hoigs prepare VIDEO --out {folder}` makes one")
+        raise ClipError(
+            f"{folder}: no such folder{did_you_mean_beside(folder, 'clip.json')} "
+            f"`hoigs prepare VIDEO --out {folder}` makes one"
+        )
 
 
 def read_clip(

@@ -20,7 +20,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.system.files import failures_named, read_json, validated, write_whole
+from hoigs.core.system.files import (
+    did_you_mean_beside,
+    failures_named,
+    read_json,
+    validated,
+    write_whole,
+)
 from hoigs.core.system.folder_lock import FolderLock
 from hoigs.core.system.safe_replace import (
     Layout,
@@ -199,6 +205,16 @@ class RunFolder:
     def require(self) -> None:
         """Raise HoigsError unless this is a run."""
         missing = RUN.missing(self.path)
+        if missing and not self.path.exists():
+            raise HoigsError(
+                f"{self.path}: no such folder{did_you_mean_beside(self.path, 'spec.yaml')} "
+                f"`hoigs train CLIP --out {self.path}` makes one"
+            )
+        if missing and (self.path / "clip.json").is_file():
+            raise HoigsError(
+                f"{self.path}: a clip, not yet a run; "
+                f"`hoigs train {self.path} --out runs/{self.path.name}` makes one of it"
+            )
         if missing:
             raise HoigsError(
                 f"{self.path}: not a run folder, {', '.join(missing)} absent; "

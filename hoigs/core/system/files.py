@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
 import json
 import re
 import stat
 import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -226,3 +227,13 @@ def printable(text: str) -> str:
     escape sequences."""
     shown = (c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)
     return "".join(shown)
+
+
+def did_you_mean_beside(path: Path, holds: str) -> str:
+    """`; did you mean "runs/mine"?` of a path that does not exist, with the folder beside it that
+    has the nearest name and a file `holds` in it, or ";"."""
+    with suppress(OSError):
+        names = [p.name for p in path.parent.iterdir() if (p / holds).is_file()]
+        near = difflib.get_close_matches(path.name, names, n=1, cutoff=0.6)
+        return f'; did you mean "{path.with_name(near[0])}"?' if near else ";"
+    return ";"
