@@ -193,7 +193,7 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
         registered=figures["registered"] / figures["images"] if "registered" in figures else None,
         reprojection_px=figures.get("reprojection_px"),
         displacement_px=figures.get("displacement_px"),
-        focal_px=round(float(draft.cameras[0].K[0, 0]), 1),
+        focal_px=round(_focal_of_video(draft), 1),
         focal_range=_focal_range(draft),
         up_known=world.known,
         up_within=world.within,
@@ -219,11 +219,16 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
     )
 
 
+def _focal_of_video(draft: Draft) -> float:
+    """Pixels of the video, as --focal has them."""
+    video = draft.video
+    return float(draft.cameras[0].K[0, 0]) * video.native_width / video.width
+
+
 def _focal_range(draft: Draft) -> tuple[float, float] | None:
-    figures, video = draft.track.figures, draft.video
+    figures, pixels = draft.track.figures, _focal_of_video(draft)
     if "focal_low_px" not in figures:
         return None
-    pixels = float(draft.cameras[0].K[0, 0]) * video.native_width / video.width
     low, high = (figures[f"focal_{end}_px"] / pixels for end in ("low", "high"))
     return round(low, 3), round(high, 3)
 

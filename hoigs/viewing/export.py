@@ -94,7 +94,8 @@ def make_exporter(format: str, settings: Sequence[str], registry: Registry) -> t
     offered = {o.key.partition(":")[2] for o in registry.manager.offers if o.key.startswith(KIND)}
     if key.partition("@")[0].partition(":")[2] not in offered:
         hint = did_you_mean(key.partition(":")[2], offered)
-        raise HoigsError(f'no format "{format}"{hint}; there are {", ".join(sorted(offered))}')
+        there = f"{hint} there" if hint else "; there"
+        raise HoigsError(f'no format "{format}"{there} are {", ".join(sorted(offered))}')
     config = validated(registry.config_class(key), parse_settings(settings, "--set"), key)
     made: Exporter = registry.concrete(key)(config)
     return made, key.partition(":")[2]

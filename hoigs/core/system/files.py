@@ -229,11 +229,15 @@ def printable(text: str) -> str:
     return "".join(shown)
 
 
-def did_you_mean_beside(path: Path, holds: str) -> str:
-    """`; did you mean "runs/mine"?` of a path that does not exist, with the folder beside it that
-    has the nearest name and a file `holds` in it, or ";"."""
+def did_you_mean_beside(path: Path, holds: str = "") -> str:
+    """`; did you mean "runs/mine"?` of a path that does not exist, with what lies beside it under
+    the nearest name, or ";".
+
+    Args:
+        holds: a file in it; only folders with such a file are proposed.
+    """
     with suppress(OSError):
-        names = [p.name for p in path.parent.iterdir() if (p / holds).is_file()]
+        names = [p.name for p in path.parent.iterdir() if not holds or (p / holds).is_file()]
         near = difflib.get_close_matches(path.name, names, n=1, cutoff=0.6)
         return f'; did you mean "{path.with_name(near[0])}"?' if near else ";"
     return ";"

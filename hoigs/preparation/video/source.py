@@ -11,7 +11,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.core.system.colmap_files import PARTS, models_in
-from hoigs.core.system.files import NotRegularError, regular_file
+from hoigs.core.system.files import NotRegularError, did_you_mean_beside, regular_file
 from hoigs.core.system.npz import holds
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -90,7 +90,10 @@ def find_source(
     """
     path = Path(path)
     if not path.exists():
-        raise SourceError(f"{path} does not exist; expected a video, or a folder with one")
+        raise SourceError(
+            f"{path} does not exist{did_you_mean_beside(path)} expected a video, or a folder with "
+            "one"
+        )
     if not path.is_dir():
         require_regular(path)
     folder = path if path.is_dir() else path.parent

@@ -281,14 +281,14 @@ def _proposed(
     if not found:
         notes.append(
             f"{entity.name}: nothing was found that moves or is held and is not the person; click "
-            "on it, such as --object 640,402@0"
+            "on it (--object X,Y@FRAME, or hoigs annotate)"
         )
     else:
         best, (point, *_) = found[0].prompt, found[0].prompt.points
         notes.append(
             f"{entity.name}: nothing was clicked, and what is at {point.x:g},{point.y:g} in frame "
-            f"{best.frame} was taken; if it is something else, click on it, such as --object "
-            "640,402@0"
+            f"{best.frame} was taken (object.jpg); if it is something else, click on it (--object "
+            "X,Y@FRAME, or hoigs annotate)"
         )
     return [p.mask for p in found], [p.prompt for p in found]
 
