@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.system.files import failures_named, read_json, validated, write_whole
-from hoigs.core.system.folder_lock import FolderLock
+from hoigs.core.system.folder_lock import FolderLock, alive
 from hoigs.core.system.safe_replace import (
     Layout,
     one_of,
@@ -263,7 +263,8 @@ class RunFolder:
         _require_text(provenance)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         for stale in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
-            if not _alive(stale.name.split(".")[-2]):
+            pid = stale.name.split(".")[-2]
+            if pid.isdigit() and not alive(int(pid)):
                 shutil.rmtree(stale)
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         shutil.rmtree(temporary, ignore_errors=True)
@@ -351,19 +352,6 @@ def _require_text(provenance: dict[str, Any]) -> None:
         raise HoigsError(
             f"...{name!r}: a name that is not text in UTF-8; rename the file or folder"
         ) from error
-
-
-def _alive(pid: str) -> bool:
-    """Whether a process of this number runs; True for a text that is no number."""
-    if not pid.isdigit():
-        return True
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def versions() -> dict[str, str]:
