@@ -174,7 +174,7 @@ class JointObjective:
             screen_offsets=offsets,
             absolute_gradients=absolutes,
         )
-        trained = [n for n in self.model.entities if not self.settled or self._is_scene(n)]
+        trained = self.model.names("scene" if self.settled else None)
         own: dict[str, Callable[[], Part]] = {
             n: partial(self._of_entity, n, view, camera, state, deformed.penalties, backgrounds)
             for n in trained
@@ -219,13 +219,10 @@ class JointObjective:
         self, view: TrainingView, camera: Camera, state: SceneState, request: RenderRequest
     ) -> Part:
         """The render of all entities, and its terms."""
-        frame, offsets = view.frame, request.screen_offsets
-        assert offsets is not None
+        frame = view.frame
         composite = self.model.draw(state.joined(), camera, request, state.moment)
         terms = self._composite(view, composite)
-        terms |= self._scene_alone(
-            frame, camera, state, composite, offsets, request.absolute_gradients
-        )
+        terms |= self._scene_alone(frame, camera, state, composite, request)
         if frame.depth is not None and self.weights["depth"] > 0:
             prior = frame.depth * self.depth_scale
             if frame.ignored is not None:
@@ -258,9 +255,6 @@ class JointObjective:
 
     def _weight_of_kind(self, term: str) -> float:
         return self.weights[term.partition("/")[0]]
-
-    def _is_scene(self, name: str) -> bool:
-        return self.model.entity(name).kind == "scene"
 
     def _settled(self, state: SceneState) -> SceneState:
         """Without gradients but of scenes."""
@@ -306,8 +300,7 @@ class JointObjective:
         camera: Camera,
         state: SceneState,
         composite: RenderOutput,
-        offsets: Tensor,
-        absolutes: Tensor | None,
+        request: RenderRequest,
     ) -> dict[str, Tensor]:
         """L_scene of the scene drawn alone, without the pixels of people and objects."""
         scenes, kind = self.model.names("scene"), self.spec.scene_loss
@@ -317,7 +310,7 @@ class JointObjective:
         left_out = frame.masks if kind == "background" else modelled
         if frame.unknown & {*left_out, *self.model.entities}:  # a mask is missing
             return {}
-        alone = self._draw_scene(camera, state, composite, offsets, absolutes)
+        alone = self._draw_scene(camera, state, composite, request)
         dynamic = union(left_out.values())
         if dynamic is not None:
             dynamic = dilate(dynamic, self.spec.dilate)
@@ -330,22 +323,24 @@ class JointObjective:
         camera: Camera,
         state: SceneState,
         composite: RenderOutput,
-        offsets: Tensor,
-        absolutes: Tensor | None,
+        request: RenderRequest,
     ) -> RenderOutput:
         """The render of the scene entities alone.
 
         Where the composite is not compared, this render has the gradients for density control.
+
+        Args:
+            request: that of the composite.
         """
-        scenes, request = self.model.names("scene"), RenderRequest()
+        scenes, own = self.model.names("scene"), RenderRequest()
         if self.spec.scene_loss != "both":
             if len(scenes) == len(self.model.entities):
                 return composite
-            request = RenderRequest(
-                screen_offsets=_of(scenes, state, offsets),
-                absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
+            own = RenderRequest(
+                screen_offsets=_of(scenes, state, request.screen_offsets),
+                absolute_gradients=_of(scenes, state, request.absolute_gradients),
             )
-        return self.model.draw(state.joined(scenes), camera, request, state.moment)
+        return self.model.draw(state.joined(scenes), camera, own, state.moment)
 
     def _alone(
         self,
@@ -435,7 +430,11 @@ class JointObjective:
                 weights[f"regularizer/{name}/{key}"] = weight
 
 
-def _of(names: Sequence[str], state: SceneState, values: Shaped[Tensor, "N C"]) -> Tensor:
+def _of(
+    names: Sequence[str], state: SceneState, values: Shaped[Tensor, "N C"] | None
+) -> Tensor | None:
     """The rows of some entities, of values with one row for each Gaussian of `state.joined()`."""
+    if values is None:
+        return None
     parts = [values[rows] for name, rows in state.slices().items() if name in names]
     return parts[0] if len(parts) == 1 else torch.cat(parts)
