@@ -31,7 +31,8 @@ from hoigs.training.losses import Comparison, Crop, depth_loss, image_losses, te
 from hoigs.training.views import TrainingView
 
 RESIDUAL_PENALTIES = ("residual_pose", "residual_means")  # on corrections by the interaction
-Part = tuple[RenderOutput | None, dict[str, Tensor], dict[str, float]]  # with terms and weights
+Terms = dict[str, tuple[Tensor, float]]  # losses by name, unweighted, and their weights
+Part = tuple[RenderOutput | None, Terms]
 WHOLE = ""  # what is of no entity: no name is empty
 CAMERA_WEIGHT = 0.1  # of camera corrections; moving all cameras and the scene changes no image
 
@@ -181,18 +182,15 @@ class JointObjective:
         }
         own[WHOLE] = partial(self._of_composite, view, camera, state, request)
         found = apart(own, (state, camera, view, backgrounds, request))
-        composite, terms, weights = found[WHOLE]
+        composite, terms = found.pop(WHOLE)
         assert composite is not None
-        for name in trained:
-            _, own_terms, own_weights = found[name]
+        for _, own_terms in found.values():
             terms |= own_terms
-            weights |= own_weights
         for name in () if self.settled else self.model.names("human"):
             crop = view.crops.get(name)
             if crop is not None:
                 more = self._human(name, frame, crop, camera, state, composite)
-                terms |= more
-                weights |= dict.fromkeys(more, self.weights["human"])
+                terms |= self._weighted(more)
         start = 0
         for objective, channel in zip(further, channels, strict=True):
             shown = None
@@ -200,20 +198,21 @@ class JointObjective:
                 end = start + channel.shape[1]
                 shown, start = composite.features[..., start:end], end
             more = objective.terms(at, composite, shown)
-            terms |= more
-            weights |= dict.fromkeys(more, objective.weight)
+            terms |= {name: (term, objective.weight) for name, term in more.items()}
         if self.cameras is not None:
-            terms["regularizer/camera"] = self.cameras.penalty(frame.position)
-            weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
+            weight = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
+            terms["regularizer/camera"] = (self.cameras.penalty(frame.position), weight)
         for name, residual in () if self.settled else state.residuals.items():
-            self._penalise_residual(name, residual, terms, weights)
+            terms |= self._of_residual(name, residual)
+        losses = {name: term for name, (term, _) in terms.items()}
+        weights = {name: weight for name, (_, weight) in terms.items()}
         total = composite.color.new_zeros(())
         if terms:
-            factors = constant(tuple(weights[name] for name in terms), total)
-            total = torch.stack([term.reshape(()) for term in terms.values()]) @ factors
+            factors = constant(tuple(weights.values()), total)
+            total = torch.stack([loss.reshape(()) for loss in losses.values()]) @ factors
         if not total.requires_grad:  # no term applies to this frame
             total = total + 0 * composite.color.sum()
-        return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
+        return ObjectiveResult(losses, total, state, composite, offsets, weights, absolutes)
 
     def _of_composite(
         self, view: TrainingView, camera: Camera, state: SceneState, request: RenderRequest
@@ -232,7 +231,7 @@ class JointObjective:
             )
             if depth is not None:
                 terms["depth"] = depth
-        return composite, terms, {name: self._weight_of_kind(name) for name in terms}
+        return composite, self._weighted(terms)
 
     def _of_entity(
         self,
@@ -244,17 +243,17 @@ class JointObjective:
         backgrounds: Mapping[str, Float[Tensor, "3"]],
     ) -> Part:
         """The terms of an entity alone: of its render, and penalties."""
-        terms: dict[str, Tensor] = {}
+        terms: Terms = {}
         kind, crop = self.model.entity(name).kind, view.crops.get(name)
         if crop is not None and name in backgrounds:
-            terms = self._alone(name, kind, crop, camera, state, backgrounds[name])
-        weights = {name: self._weight_of_kind(name) for name in terms}
+            alone = self._alone(name, kind, crop, camera, state, backgrounds[name])
+            terms = self._weighted(alone)
         own = None if penalties is None else penalties[name]
-        self._regularize(name, state.gaussians[name], own, terms, weights)
-        return None, terms, weights
+        return None, terms | self._penalties(name, state.gaussians[name], own)
 
-    def _weight_of_kind(self, term: str) -> float:
-        return self.weights[term.partition("/")[0]]
+    def _weighted(self, terms: Mapping[str, Tensor]) -> Terms:
+        """Terms with the weight of what they are of, which their names begin with."""
+        return {name: (term, self.weights[name.partition("/")[0]]) for name, term in terms.items()}
 
     def _settled(self, state: SceneState) -> SceneState:
         """Without gradients but of scenes."""
@@ -397,24 +396,16 @@ class JointObjective:
                 terms[f"human/{name}/face"] = self.spec.face * face
         return terms
 
-    def _penalise_residual(
-        self, name: str, residual: Residual, terms: dict[str, Tensor], weights: dict[str, float]
-    ) -> None:
+    def _of_residual(self, name: str, residual: Residual) -> Terms:
         """Mean squared correction by the interaction, radians^2 and metres^2."""
+        found = {}
         for key, value in zip(RESIDUAL_PENALTIES, (residual.pose, residual.means), strict=True):
             weight = self.spec.regularizers.get(key, 0.0)
             if weight > 0 and value is not None:
-                terms[f"regularizer/{name}/{key}"] = value.square().sum(-1).mean()
-                weights[f"regularizer/{name}/{key}"] = weight
+                found[f"regularizer/{name}/{key}"] = (value.square().sum(-1).mean(), weight)
+        return found
 
-    def _regularize(
-        self,
-        name: str,
-        current: Gaussians,
-        own: Mapping[str, Tensor] | None,
-        terms: dict[str, Tensor],
-        weights: dict[str, float],
-    ) -> None:
+    def _penalties(self, name: str, current: Gaussians, own: Mapping[str, Tensor] | None) -> Terms:
         """Penalties of the deformation and of density control that have a weight.
 
         Args:
@@ -423,11 +414,11 @@ class JointObjective:
         penalties = dict(self.model.entity(name).regularizers() if own is None else own)
         if name in self.density:
             penalties |= self.density[name].regularizers(current)
-        for key, value in penalties.items():
-            weight = self.weight_of(name, key)
-            if weight > 0:
-                terms[f"regularizer/{name}/{key}"] = value
-                weights[f"regularizer/{name}/{key}"] = weight
+        return {
+            f"regularizer/{name}/{key}": (value, weight)
+            for key, value in penalties.items()
+            if (weight := self.weight_of(name, key)) > 0
+        }
 
 
 def _of(
