@@ -57,9 +57,15 @@ class Interrupted(KeyboardInterrupt):
 def require_type(owner: str, argument: str, value: object, expected: type) -> None:
     """Raise TypeError, naming the argument and both types, when `value` is no `expected`."""
     if not isinstance(value, expected):
-        found = value.__name__ if isinstance(value, type) else type(value).__name__
         kind = "the class" if isinstance(value, type) else "of type"
-        raise TypeError(f"{owner}: {argument} is {kind} {found}, expected {expected.__name__}")
+        raise TypeError(
+            f"{owner}: {argument} is {kind} {class_name(value)}, expected {expected.__name__}"
+        )
+
+
+def class_name(part: object) -> str:
+    """The name of a class, or of the class of an instance."""
+    return part.__name__ if isinstance(part, type) else type(part).__name__
 
 
 def did_you_mean(name: str, valid: Iterable[str], count: int = 1) -> str:

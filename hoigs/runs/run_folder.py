@@ -27,7 +27,7 @@ from hoigs.core.system.files import (
     validated,
     write_whole,
 )
-from hoigs.core.system.folder_lock import FolderLock
+from hoigs.core.system.folder_lock import FolderLock, alive
 from hoigs.core.system.safe_replace import (
     Layout,
     one_of,
@@ -279,7 +279,8 @@ class RunFolder:
         _require_text(provenance)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         for stale in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.part"):
-            if not _alive(stale.name.split(".")[-2]):
+            pid = stale.name.split(".")[-2]
+            if pid.isdigit() and not alive(int(pid)):
                 shutil.rmtree(stale)
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
         shutil.rmtree(temporary, ignore_errors=True)
@@ -367,19 +368,6 @@ def _require_text(provenance: dict[str, Any]) -> None:
         raise HoigsError(
             f"...{name!r}: a name that is not text in UTF-8; rename the file or folder"
         ) from error
-
-
-def _alive(pid: str) -> bool:
-    """Whether a process of this number runs; True for a text that is no number."""
-    if not pid.isdigit():
-        return True
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def versions() -> dict[str, str]:

@@ -25,20 +25,6 @@ class EntityDensity:
         self.entity, self.control, self.extent = entity, control, extent
         self.statistics = DensityStatistics.zeros(len(entity), entity.means.device)
 
-    def gather(
-        self,
-        screen_gradient: torch.Tensor,
-        radii: torch.Tensor,
-        width: int,
-        height: int,
-        absolute_gradient: torch.Tensor | None,
-        loss: torch.Tensor,
-    ) -> None:
-        self.statistics.add(
-            screen_gradient, radii, width, height, absolute_gradient=absolute_gradient,
-            loss=loss.detach(),
-        )  # fmt: skip
-
     def refine(
         self, current: Gaussians, optimizer: GroupedAdam, step: int, total_steps: int
     ) -> bool:

@@ -109,12 +109,10 @@ def face_pixels(
     with torch.no_grad():
         turn = kabsch(entity.means[rows], points) if len(rows) >= 3 else torch.eye(3).to(points)
         towards = torch.nn.functional.normalize(camera.center - points, dim=-1)
-        at = pixels.floor().long()
-        size = at.new_tensor((camera.width, camera.height))
-        seen = ((at >= 0) & (at < size)).all(1) & (depth > 1e-3)
+        seen = camera.shows(pixels, depth, near=1e-3)
         seen &= ((normals @ turn.mT) * towards).sum(-1) > FACING
-        at = torch.minimum(at.clamp_min(0), size - 1)
-        seen &= mask[at[:, 1], at[:, 0]]
+        column, row = torch.where(seen[:, None], pixels, 0).long().unbind(1)
+        seen &= mask[row, column]
     return pixels, seen
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -33,6 +34,26 @@ def leaves_of(parameters: Mapping[str, nn.Parameter]) -> dict[str, Tensor]:
     control changes, and the stream on which it was last used.
     """
     return {name: p.detach().requires_grad_() for name, p in parameters.items()}
+
+
+@contextmanager
+def on_stream(stream: torch.cuda.Stream) -> Iterator[None]:
+    """Capture on a stream in the block, which waits for the present one, and that for it then."""
+    current = torch.cuda.current_stream(stream.device)
+    stream.wait_stream(current)
+    # set the stream here too: a capture that fails does not restore the previous one
+    with torch.cuda.device(stream.device), torch.cuda.stream(stream):
+        yield
+    current.wait_stream(stream)
+
+
+def in_one_tensor(gradients: Sequence[Tensor | None]) -> tuple[list[int], list[int], Tensor]:
+    """Places of the gradients that there are, how many numbers each has, and all in one tensor."""
+    found = {i: gradient for i, gradient in enumerate(gradients) if gradient is not None}
+    # multiples of 16 bytes first, which keeps them aligned: fused Adam is faster then
+    order = sorted(found, key=lambda i: found[i].numel() % 4 != 0)
+    sizes = [found[i].numel() for i in order]
+    return order, sizes, torch.cat([found[i].reshape(-1) for i in order])
 
 
 class GraphedStep:
@@ -67,9 +88,7 @@ class GraphedStep:
         self._compute, self.parameters = compute, dict(parameters)
         self._graphs: tuple[torch.cuda.CUDAGraph, torch.cuda.CUDAGraph] | None = None
         self._replay_index = 0
-        self._zero_filled: set[int] = (
-            set()
-        )  # indices of upstream gradients that are filled with zeros
+        self._zero_filled: set[int] = set()  # indices of upstream gradients that are zeros
         if stream is None:
             self._warm_up()
         else:
@@ -134,12 +153,7 @@ class GraphedStep:
             list(self.differentiable.values()), list(self._leaves.values()), self._upstream,
             allow_unused=True,
         )  # fmt: skip
-        reached = [i for i, gradient in enumerate(found) if gradient is not None]
-        # multiples of 16 bytes first, which keeps them aligned: fused Adam is faster then
-        self._order = sorted(reached, key=lambda i: found[i].numel() % 4 != 0)
-        self._sizes = [found[i].numel() for i in self._order]
-        # one tensor for all, so that one copy suffices
-        self._flat = torch.cat([found[i].reshape(-1) for i in self._order])
+        self._order, self._sizes, self._flat = in_one_tensor(found)  # so that one copy suffices
 
     def _warm_up(self) -> None:
         """Run once without a graph: find the outputs, and do what only a first call does."""
@@ -154,17 +168,13 @@ class GraphedStep:
         self._run_backward()
 
     def _capture(self, stream: torch.cuda.Stream) -> None:
-        current = torch.cuda.current_stream(stream.device)
-        stream.wait_stream(current)
         graphs = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
-        # set the stream here too: a capture that fails does not restore the previous one
-        with torch.cuda.device(stream.device), torch.cuda.stream(stream):
+        with on_stream(stream):
             self._warm_up()
             with capturing(graphs[0], stream):
                 self._run()
             with capturing(graphs[1], stream, pool=graphs[0].pool()):
                 self._run_backward()
-        current.wait_stream(stream)
         self.differentiable = {key: value.detach() for key, value in self.differentiable.items()}
         self._leaves = {}
         self._graphs = graphs

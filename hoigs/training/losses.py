@@ -256,6 +256,8 @@ def _area(one: Comparison) -> int:
 
 # Crops of a frame around one entity, and the masks in them.
 
+MARGIN = 0.15  # of the box, as a share of its size
+
 
 @dataclass(frozen=True)
 class Crop:
@@ -303,9 +305,7 @@ def union(masks: Iterable[Bool[Tensor, "H W"]]) -> Bool[Tensor, "H W"] | None:
     return total
 
 
-def crop_around(
-    frame: Frame, entity: str, on_device: Frame | None = None, margin: float = 0.15
-) -> Crop | None:
+def crop_around(frame: Frame, entity: str, on_device: Frame | None = None) -> Crop | None:
     """The box of an entity's mask with a margin relative to its size; None if the mask is empty.
 
     Args:
@@ -321,7 +321,7 @@ def crop_around(
     top, bottom = int(rows[0]), int(rows[-1]) + 1
     left, right = int(columns[0]), int(columns[-1]) + 1
     area = int(np.count_nonzero(flat[top:bottom, left:right]))
-    pad = max(8, round(margin * max(bottom - top, right - left)))
+    pad = max(8, round(MARGIN * max(bottom - top, right - left)))
     top, left = max(0, top - pad), max(0, left - pad)
     bottom, right = min(camera.height, bottom + pad), min(camera.width, right + pad)
     box = (slice(top, bottom), slice(left, right))

@@ -31,7 +31,8 @@ from hoigs.training.losses import Comparison, Crop, depth_loss, image_losses, te
 from hoigs.training.views import TrainingView
 
 RESIDUAL_PENALTIES = ("residual_pose", "residual_means")  # on corrections by the interaction
-Part = tuple[RenderOutput | None, dict[str, Tensor], dict[str, float]]  # with terms and weights
+Terms = dict[str, tuple[Tensor, float]]  # losses by name, unweighted, and their weights
+Part = tuple[RenderOutput | None, Terms]
 WHOLE = ""  # what is of no entity: no name is empty
 CAMERA_WEIGHT = 0.1  # of camera corrections; moving all cameras and the scene changes no image
 
@@ -174,25 +175,22 @@ class JointObjective:
             screen_offsets=offsets,
             absolute_gradients=absolutes,
         )
-        trained = [n for n in self.model.entities if not self.settled or self._is_scene(n)]
+        trained = self.model.names("scene" if self.settled else None)
         own: dict[str, Callable[[], Part]] = {
             n: partial(self._of_entity, n, view, camera, state, deformed.penalties, backgrounds)
             for n in trained
         }
         own[WHOLE] = partial(self._of_composite, view, camera, state, request)
         found = apart(own, (state, camera, view, backgrounds, request))
-        composite, terms, weights = found[WHOLE]
+        composite, terms = found.pop(WHOLE)
         assert composite is not None
-        for name in trained:
-            _, own_terms, own_weights = found[name]
+        for _, own_terms in found.values():
             terms |= own_terms
-            weights |= own_weights
         for name in () if self.settled else self.model.names("human"):
             crop = view.crops.get(name)
             if crop is not None:
                 more = self._human(name, frame, crop, camera, state, composite)
-                terms |= more
-                weights |= dict.fromkeys(more, self.weights["human"])
+                terms |= self._weighted(more)
         start = 0
         for objective, channel in zip(further, channels, strict=True):
             shown = None
@@ -200,32 +198,30 @@ class JointObjective:
                 end = start + channel.shape[1]
                 shown, start = composite.features[..., start:end], end
             more = objective.terms(at, composite, shown)
-            terms |= more
-            weights |= dict.fromkeys(more, objective.weight)
+            terms |= {name: (term, objective.weight) for name, term in more.items()}
         if self.cameras is not None:
-            terms["regularizer/camera"] = self.cameras.penalty(frame.position)
-            weights["regularizer/camera"] = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
+            weight = self.spec.regularizers.get("camera", CAMERA_WEIGHT)
+            terms["regularizer/camera"] = (self.cameras.penalty(frame.position), weight)
         for name, residual in () if self.settled else state.residuals.items():
-            self._penalise_residual(name, residual, terms, weights)
+            terms |= self._of_residual(name, residual)
+        losses = {name: term for name, (term, _) in terms.items()}
+        weights = {name: weight for name, (_, weight) in terms.items()}
         total = composite.color.new_zeros(())
         if terms:
-            factors = constant(tuple(weights[name] for name in terms), total)
-            total = torch.stack([term.reshape(()) for term in terms.values()]) @ factors
+            factors = constant(tuple(weights.values()), total)
+            total = torch.stack([loss.reshape(()) for loss in losses.values()]) @ factors
         if not total.requires_grad:  # no term applies to this frame
             total = total + 0 * composite.color.sum()
-        return ObjectiveResult(terms, total, state, composite, offsets, weights, absolutes)
+        return ObjectiveResult(losses, total, state, composite, offsets, weights, absolutes)
 
     def _of_composite(
         self, view: TrainingView, camera: Camera, state: SceneState, request: RenderRequest
     ) -> Part:
         """The render of all entities, and its terms."""
-        frame, offsets = view.frame, request.screen_offsets
-        assert offsets is not None
+        frame = view.frame
         composite = self.model.draw(state.joined(), camera, request, state.moment)
         terms = self._composite(view, composite)
-        terms |= self._scene_alone(
-            frame, camera, state, composite, offsets, request.absolute_gradients
-        )
+        terms |= self._scene_alone(frame, camera, state, composite, request)
         if frame.depth is not None and self.weights["depth"] > 0:
             prior = frame.depth * self.depth_scale
             if frame.ignored is not None:
@@ -235,7 +231,7 @@ class JointObjective:
             )
             if depth is not None:
                 terms["depth"] = depth
-        return composite, terms, {name: self._weight_of_kind(name) for name in terms}
+        return composite, self._weighted(terms)
 
     def _of_entity(
         self,
@@ -247,20 +243,17 @@ class JointObjective:
         backgrounds: Mapping[str, Float[Tensor, "3"]],
     ) -> Part:
         """The terms of an entity alone: of its render, and penalties."""
-        terms: dict[str, Tensor] = {}
+        terms: Terms = {}
         kind, crop = self.model.entity(name).kind, view.crops.get(name)
         if crop is not None and name in backgrounds:
-            terms = self._alone(name, kind, crop, camera, state, backgrounds[name])
-        weights = {name: self._weight_of_kind(name) for name in terms}
+            alone = self._alone(name, kind, crop, camera, state, backgrounds[name])
+            terms = self._weighted(alone)
         own = None if penalties is None else penalties[name]
-        self._regularize(name, state.gaussians[name], own, terms, weights)
-        return None, terms, weights
+        return None, terms | self._penalties(name, state.gaussians[name], own)
 
-    def _weight_of_kind(self, term: str) -> float:
-        return self.weights[term.partition("/")[0]]
-
-    def _is_scene(self, name: str) -> bool:
-        return self.model.entity(name).kind == "scene"
+    def _weighted(self, terms: Mapping[str, Tensor]) -> Terms:
+        """Terms with the weight of what they are of, which their names begin with."""
+        return {name: (term, self.weights[name.partition("/")[0]]) for name, term in terms.items()}
 
     def _settled(self, state: SceneState) -> SceneState:
         """Without gradients but of scenes."""
@@ -306,8 +299,7 @@ class JointObjective:
         camera: Camera,
         state: SceneState,
         composite: RenderOutput,
-        offsets: Tensor,
-        absolutes: Tensor | None,
+        request: RenderRequest,
     ) -> dict[str, Tensor]:
         """L_scene of the scene drawn alone, without the pixels of people and objects."""
         scenes, kind = self.model.names("scene"), self.spec.scene_loss
@@ -317,7 +309,7 @@ class JointObjective:
         left_out = frame.masks if kind == "background" else modelled
         if frame.unknown & {*left_out, *self.model.entities}:  # a mask is missing
             return {}
-        alone = self._draw_scene(camera, state, composite, offsets, absolutes)
+        alone = self._draw_scene(camera, state, composite, request)
         dynamic = union(left_out.values())
         if dynamic is not None:
             dynamic = dilate(dynamic, self.spec.dilate)
@@ -330,22 +322,24 @@ class JointObjective:
         camera: Camera,
         state: SceneState,
         composite: RenderOutput,
-        offsets: Tensor,
-        absolutes: Tensor | None,
+        request: RenderRequest,
     ) -> RenderOutput:
         """The render of the scene entities alone.
 
         Where the composite is not compared, this render has the gradients for density control.
+
+        Args:
+            request: that of the composite.
         """
-        scenes, request = self.model.names("scene"), RenderRequest()
+        scenes, own = self.model.names("scene"), RenderRequest()
         if self.spec.scene_loss != "both":
             if len(scenes) == len(self.model.entities):
                 return composite
-            request = RenderRequest(
-                screen_offsets=_of(scenes, state, offsets),
-                absolute_gradients=None if absolutes is None else _of(scenes, state, absolutes),
+            own = RenderRequest(
+                screen_offsets=_of(scenes, state, request.screen_offsets),
+                absolute_gradients=_of(scenes, state, request.absolute_gradients),
             )
-        return self.model.draw(state.joined(scenes), camera, request, state.moment)
+        return self.model.draw(state.joined(scenes), camera, own, state.moment)
 
     def _alone(
         self,
@@ -402,24 +396,16 @@ class JointObjective:
                 terms[f"human/{name}/face"] = self.spec.face * face
         return terms
 
-    def _penalise_residual(
-        self, name: str, residual: Residual, terms: dict[str, Tensor], weights: dict[str, float]
-    ) -> None:
+    def _of_residual(self, name: str, residual: Residual) -> Terms:
         """Mean squared correction by the interaction, radians^2 and metres^2."""
+        found = {}
         for key, value in zip(RESIDUAL_PENALTIES, (residual.pose, residual.means), strict=True):
             weight = self.spec.regularizers.get(key, 0.0)
             if weight > 0 and value is not None:
-                terms[f"regularizer/{name}/{key}"] = value.square().sum(-1).mean()
-                weights[f"regularizer/{name}/{key}"] = weight
+                found[f"regularizer/{name}/{key}"] = (value.square().sum(-1).mean(), weight)
+        return found
 
-    def _regularize(
-        self,
-        name: str,
-        current: Gaussians,
-        own: Mapping[str, Tensor] | None,
-        terms: dict[str, Tensor],
-        weights: dict[str, float],
-    ) -> None:
+    def _penalties(self, name: str, current: Gaussians, own: Mapping[str, Tensor] | None) -> Terms:
         """Penalties of the deformation and of density control that have a weight.
 
         Args:
@@ -428,14 +414,18 @@ class JointObjective:
         penalties = dict(self.model.entity(name).regularizers() if own is None else own)
         if name in self.density:
             penalties |= self.density[name].regularizers(current)
-        for key, value in penalties.items():
-            weight = self.weight_of(name, key)
-            if weight > 0:
-                terms[f"regularizer/{name}/{key}"] = value
-                weights[f"regularizer/{name}/{key}"] = weight
+        return {
+            f"regularizer/{name}/{key}": (value, weight)
+            for key, value in penalties.items()
+            if (weight := self.weight_of(name, key)) > 0
+        }
 
 
-def _of(names: Sequence[str], state: SceneState, values: Shaped[Tensor, "N C"]) -> Tensor:
+def _of(
+    names: Sequence[str], state: SceneState, values: Shaped[Tensor, "N C"] | None
+) -> Tensor | None:
     """The rows of some entities, of values with one row for each Gaussian of `state.joined()`."""
+    if values is None:
+        return None
     parts = [values[rows] for name, rows in state.slices().items() if name in names]
     return parts[0] if len(parts) == 1 else torch.cat(parts)

@@ -30,7 +30,7 @@ from hoigs.core.system.files import write_whole
 from hoigs.core.system.random_state import callers_random_state
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.values.clip import POSES_EXACT, BodyTrack, Clip
-from hoigs.core.values.moment import BodyPose
+from hoigs.core.values.moment import POSE, BodyPose
 from hoigs.plugins.deformation.skinned_body import SkinnedBody
 from hoigs.runs.choices import pick_device
 from hoigs.runs.clip_source import clip_folder, read_clip, require_folder
@@ -54,8 +54,6 @@ SETTINGS = (
     "train.preview_every=0",
 )
 
-
-FIELDS = ("global_orient", "body", "left_hand", "right_hand", "transl")
 SMOOTHED = (0.0, 0.05, 0.1, 0.2, 0.4)  # seconds
 BODY_JOINTS = 22  # without hands, jaw and eyes
 
@@ -178,7 +176,7 @@ def _refined(person: SkinnedBody, clip: Clip, name: str, steps: int) -> BodyTrac
     changes = {
         field: torch.stack([getattr(poses[i], field) for i in frames])
         - getattr(track.poses, field)[frames]
-        for field in FIELDS
+        for field in POSE
     }
     most = _trembling(track, person.body)
     refined, width = track, 0.0

@@ -25,8 +25,10 @@ from hoigs.training.graphs import (
     GraphKey,
     components_of,
     first_difference,
+    in_one_tensor,
     leaves_of,
     mode_of,
+    on_stream,
     root_cause,
 )
 from hoigs.training.losses import Crop
@@ -378,15 +380,11 @@ class _CapturedStep:
         self._graph: torch.cuda.CUDAGraph | None = None
         if stream is None:
             return
-        current = torch.cuda.current_stream(stream.device)
-        stream.wait_stream(current)
         graph = torch.cuda.CUDAGraph()
-        # set the stream here too: a capture that fails does not restore the previous one
-        with torch.cuda.device(stream.device), torch.cuda.stream(stream), side_by_side({}):
+        with on_stream(stream), side_by_side({}):
             self._compute()  # what only a first call does
             with capturing(graph, stream):
                 self._compute()
-        current.wait_stream(stream)
         self._graph = graph
 
     def run(self, view: TrainingView) -> ObjectiveResult:
@@ -429,17 +427,12 @@ class _CapturedStep:
             drawn.append(result.absolute_gradients)
         found = torch.autograd.grad(result.total, [*leaves.values(), *drawn], allow_unused=True)
         ours, of_drawn = found[: len(leaves)], found[len(leaves) :]
-        reached = [i for i, gradient in enumerate(ours) if gradient is not None]
-        # multiples of 16 bytes first, which keeps them aligned: fused Adam is faster then
-        reached.sort(key=lambda i: ours[i].numel() % 4 != 0)
-        # in memory of the graph's own, each replay writes all of it
-        flat = torch.cat([ours[i].reshape(-1) for i in reached])
+        order, sizes, flat = in_one_tensor(ours)  # of the graph's own, written by each replay
         finite = torch.isfinite(flat).all()
         parameters = list(self._parameters.values())
-        pieces = flat.split([ours[i].numel() for i in reached])
         self._gradients = [
             (parameters[i], piece.view(parameters[i].shape))
-            for i, piece in zip(reached, pieces, strict=True)
+            for i, piece in zip(order, flat.split(sizes), strict=True)
         ]
         self._result = _without_history(result, finite, of_drawn)
 

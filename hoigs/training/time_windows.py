@@ -36,6 +36,7 @@ from hoigs.core.values.moment import Moment
 from hoigs.training.optimizer import GroupedAdam, Schedule
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
+BETAS = 0.9, 0.999  # of Adam
 FADED = 120  # steps without a gradient after which a moment moves nothing any more
 
 
@@ -252,7 +253,6 @@ def _caught_up(
     last: Int[np.ndarray, " R"],
     done: int,
     rates: Callable[[Int[np.ndarray, "S R"]], Float[np.ndarray, "S R"]],
-    betas: tuple[float, float] = (0.9, 0.999),
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Rows and their moments after steps of Adam without a gradient.
 
@@ -263,7 +263,7 @@ def _caught_up(
     missed = (done - last).astype(np.float64)
     if not missed.any():
         return values, mean, square
-    first, second = betas
+    first, second = BETAS
     step = np.arange(1, FADED + 1)[:, None]
     at = np.maximum(last, 1) + step
     moves = first**step / second ** (step / 2) * np.sqrt(1 - second**at) / (1 - first**at)

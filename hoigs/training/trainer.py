@@ -19,9 +19,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.clip_folder.health import depth_factor
-from hoigs.core.errors import Interrupted
+from hoigs.core.errors import CheckpointError, Interrupted
 from hoigs.core.interfaces.deformation import DeformationModel, StepStatistics
-from hoigs.core.interfaces.density import DensityControl, check_rasterizer
+from hoigs.core.interfaces.density import DensityControl, DensityStatistics, check_rasterizer
 from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gradients
 from hoigs.core.model.objective import Weighted
 from hoigs.core.model.scene import SceneModel
@@ -32,9 +32,9 @@ from hoigs.core.values.clip import Clip, Frame
 from hoigs.core.values.moment import Moment
 from hoigs.metrics.lpips import Lpips
 from hoigs.metrics.psnr import psnr, region_psnr
-from hoigs.runs.checkpoint import Checkpoint
+from hoigs.runs.checkpoint import FORMAT, VERSION, Checkpoint, restore_cameras, restore_model
 from hoigs.runs.run_folder import RunFolder
-from hoigs.training.checkpointing import CheckpointWriter, EpochSampler, checkpoint_of, restore
+from hoigs.training.checkpointing import CheckpointWriter, EpochSampler
 from hoigs.training.density import EntityDensity, evolve
 from hoigs.training.face import unwrap_faces
 from hoigs.training.nan_guard import (
@@ -51,6 +51,8 @@ from hoigs.training.unseen import Filling
 from hoigs.training.views import TrainingViews
 
 # What training reports of itself: logged steps, and PSNR of previews.
+
+PREVIEWED = 4  # frames
 
 
 @dataclass(frozen=True)
@@ -77,19 +79,17 @@ class StepReport:
 
 
 @torch.no_grad()
-def preview_scores(
-    clip: Clip, draw: Callable[[Frame], Float[Tensor, "H W 3"]], frames: int = 4
-) -> dict[str, float]:
-    """PSNR of a few frames of each split, in dB, for the curves of the report.
+def preview_scores(clip: Clip, draw: Callable[[Frame], Float[Tensor, "H W 3"]]) -> dict[str, float]:
+    """PSNR of PREVIEWED frames of each split, in dB, for the curves of the report.
 
     Args:
         draw: the picture of a frame, by the model as it is now.
     """
     scores = {}
     for split, positions in clip.split.items():
-        stride = max(1, len(positions) // frames)
+        stride = max(1, len(positions) // PREVIEWED)
         values = []
-        for position in list(positions)[::stride][:frames]:
+        for position in list(positions)[::stride][:PREVIEWED]:
             frame = clip[position]
             color = draw(frame).cpu().clamp(0, 1)
             if frame.ignored is None:
@@ -145,11 +145,6 @@ class StopRequest:
         for number, before in self._before.items():
             signal.signal(number, signal.SIG_DFL if before is None else before)
         self._before = {}
-
-
-def resume_command(run: RunFolder) -> str:
-    """The command that continues the run in a folder."""
-    return f"hoigs train --resume --out {shlex.quote(str(run.path))}"
 
 
 class Trainer:
@@ -287,9 +282,10 @@ class Trainer:
             if writer is not None:
                 writer.after(self.step, signal is not None)
             if self.run is not None and signal is not None and self.step < end:
+                out = shlex.quote(str(self.run.path))
                 raise Interrupted(
                     f"stopped at step {self.step} of {self.spec.steps}; continue with: "
-                    f"{resume_command(self.run)}",
+                    f"hoigs train --resume --out {out}",
                     signal,
                 )
         self.model.eval()
@@ -387,7 +383,10 @@ class Trainer:
             row = rows[name]
             if gradient is not None:
                 mine = None if absolute is None else absolute[row]
-                density.gather(gradient[row], radii[row], width, height, mine, result.total)
+                density.statistics.add(
+                    gradient[row], radii[row], width, height, absolute_gradient=mine,
+                    loss=result.total.detach(),
+                )  # fmt: skip
             density.refine(result.state.gaussians[name], self.optimizer, self.step, self.spec.steps)
             rate = self.optimizer.position_rate(name)
             density.perturb(self.step, self.spec.steps, rate)
@@ -412,11 +411,8 @@ class Trainer:
             loss=total,
             losses=losses,
             counts=self.model.count(),
-            psnr=self._preview() if scored else {},
+            psnr=preview_scores(self.clip, self._draw) if scored else {},
         )
-
-    def _preview(self) -> dict[str, float]:
-        return preview_scores(self.clip, self._draw)
 
     def _draw(self, frame: Frame) -> torch.Tensor:
         moment = frame.moment.to(self.model.device)
@@ -424,7 +420,30 @@ class Trainer:
 
     def checkpoint(self) -> Checkpoint:
         """The complete state of training; see Checkpoint."""
-        return checkpoint_of(self, finished=self.step == self.spec.steps)
+        windows = self.windows
+        files = {} if windows is None else windows.files(finished=self.step == self.spec.steps)
+        tensors = {f"model.{k}": v for k, v in self.model.state_dict().items()}
+        tensors |= {f"optimizer.{k}": v for k, v in self.optimizer.tensors().items()}
+        for name, density in self.density.items():
+            tensors |= {f"density.{name}.{k}": v for k, v in vars(density.statistics).items()}
+        if self.cameras is not None:
+            tensors |= {f"cameras.{k}": v for k, v in self.cameras.state_dict().items()}
+        if windows is not None:
+            tensors |= {f"windows.{k}": v for k, v in windows.state().items()}
+        tensors |= {f"hidden.{k}": v for k, v in self.unseen.hidden.items()}
+        tensors["rng.generator"] = self.generator.get_state()
+        tensors["rng.torch"] = torch.get_rng_state()
+        meta = {
+            "format": FORMAT,
+            "version": VERSION,
+            "step": self.step,
+            "time_s": self.elapsed,
+            "counts": self.model.count(),
+            "sampler": self.sampler.state(),
+            "skipped": self.guard.skipped,
+            **self.identity,
+        }
+        return Checkpoint(tensors, meta, files)
 
     def resume(self, checkpoint: Checkpoint) -> None:
         """Restore a checkpoint; the rest of the run then equals an unbroken one.
@@ -432,6 +451,33 @@ class Trainer:
         Raises:
             CheckpointError: it belongs to another spec or clip, is damaged, or holds a model alone.
         """
-        restore(self, checkpoint)
+        it = f"the checkpoint of step {checkpoint.meta['step']}"
+        if not checkpoint.part("optimizer"):
+            raise CheckpointError(
+                f"{it} was pruned or compressed: it has a model, but no optimizer state to resume "
+                "with"
+            )
+        try:
+            self._restore(checkpoint)
+        except (KeyError, RuntimeError, TypeError, ValueError, AttributeError) as error:
+            raise CheckpointError(f"{it} is damaged: {error}") from error
         if self.run is not None:
             self.run.cut_metrics(self.step)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        device = self.model.device
+        restore_model(self.model, checkpoint, self.hashes)
+        restore_cameras(self.cameras, checkpoint)
+        self.optimizer.load_tensors(checkpoint.part("optimizer"))
+        for name, density in self.density.items():
+            density.statistics = DensityStatistics.zeros(len(density.entity), device)
+            for key, value in checkpoint.part(f"density.{name}").items():
+                setattr(density.statistics, key, value.to(device).clone())
+        hidden = checkpoint.part("hidden")
+        self.unseen.hidden = {name: kept.to(device) for name, kept in hidden.items()}
+        self.generator.set_state(checkpoint.tensors["rng.generator"])
+        torch.set_rng_state(checkpoint.tensors["rng.torch"])
+        self.sampler.load(checkpoint.meta["sampler"])
+        if self.windows is not None:
+            self.windows.load(checkpoint.part("windows"))
+        self.step, self.elapsed = checkpoint.meta["step"], checkpoint.meta["time_s"]

@@ -13,7 +13,7 @@ SiCloPe), and the hidden part of a scene those of the clip's own points there.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -171,29 +171,10 @@ def fill_hidden(
         size = size.minimum(room(gaussians.means[hidden], gaussians.means[known], centers))
         size = size.clamp_min(1e-6).log()[:, None].to(gaussians.log_scales).expand(-1, 3)
         target["log_scales"] = torch.where(within[:, None], size, gaussians.log_scales[hidden])
-        logits = gaussians.opacity_logits[hidden]
-        target["opacity_logits"] = torch.where(within, _logit(OPAQUE), logits)
-    for name, value in target.items():
-        parameter = scene.get_parameter(name)
-        if parameter.requires_grad:
-            weight = (1 - kept[hidden]).reshape(-1, *[1] * (value.ndim - 1))
-            parameter[hidden] += weight * (value - parameter[hidden])
+        logit, logits = math.log(OPAQUE / (1 - OPAQUE)), gaussians.opacity_logits[hidden]
+        target["opacity_logits"] = torch.where(within, logit, logits)
+    _blend(scene, gaussians[hidden], target, 1 - kept[hidden], hidden)
     return kept
-
-
-def spare_hidden(model: SceneModel, kept: Mapping[str, Float[Tensor, " N"]]) -> None:
-    """Scale the gradients of Gaussians by how much of them is kept, by entity.
-
-    Where density control has changed the number of an entity's Gaussians since, they stay.
-    """
-    for name, share in kept.items():
-        entity = model.entity(name)
-        if len(entity) != len(share):
-            continue
-        for field in FIELDS:
-            gradient = entity.get_parameter(field).grad
-            if gradient is not None:
-                gradient.mul_(share.reshape(-1, *[1] * (gradient.ndim - 1)))
 
 
 def _colors(
@@ -235,10 +216,6 @@ def room(
     return most
 
 
-def _logit(share: float) -> float:
-    return math.log(share / (1 - share))
-
-
 # How much of each Gaussian the training frames show.
 
 FRAMES = 16  # training frames in which weights are summed
@@ -247,14 +224,14 @@ HALF_SEEN = 0.1  # half is known at this part of a well seen Gaussian's weight, 
 WELL_SEEN = 0.9  # quantile, among Gaussians with any weight, of a well seen one
 
 
-def training_frames(clip: Clip, frames: int = FRAMES) -> Sequence[int]:
+def training_frames(clip: Clip) -> Sequence[int]:
     """Positions of some training frames, evenly spread."""
     positions = clip.split["train"]
-    return positions[:: max(1, math.ceil(len(positions) / frames))]
+    return positions[:: max(1, math.ceil(len(positions) / FRAMES))]
 
 
 def seen_weights(
-    model: SceneModel, clip: Clip, frames: int = FRAMES
+    model: SceneModel, clip: Clip
 ) -> dict[str, tuple[Float[Tensor, " N"], Float[Tensor, " N"]]]:
     """Blending weights of each entity's Gaussians, summed over pixels and training frames: as they
     are, and as they would be with nothing before them, but of a scene without people and objects.
@@ -264,7 +241,7 @@ def seen_weights(
     """
     scenes, names = model.names("scene"), (*model.names("human"), *model.names("object"))
     sums: dict[str, tuple[Tensor, Tensor]] = {}
-    for position in training_frames(clip, frames):
+    for position in training_frames(clip):
         frame = clip[position]
         moment, camera = frame.moment.to(model.device), frame.camera.to(model.device)
         with torch.no_grad():
@@ -356,7 +333,7 @@ def fill_unseen(
         own, scenes: fill people and objects, and scenes.
 
     Returns:
-        Of each scene that hides in part, how much of its Gaussians is kept (see `spare_hidden`).
+        Of each scene that hides in part, how much of its Gaussians is kept (see `Filling.spare`).
     """
     entities = (*model.names("human"), *model.names("object"))
     if not entities:
@@ -408,13 +385,22 @@ def _fill(entity: Entity, seen: Float[Tensor, " N"], shapes: bool, opposite: boo
 
 
 def _blend(
-    entity: Entity, drawn: Gaussians, target: dict[str, Tensor], share: Float[Tensor, " N"]
+    entity: Entity,
+    drawn: Gaussians,
+    target: dict[str, Tensor],
+    share: Float[Tensor, " M"],
+    rows: slice | Int[Tensor, " M"] = slice(None),
 ) -> None:
-    """Move fields that are trained from `drawn` towards `target`, in place."""
+    """Move fields that are trained from `drawn` towards `target`, in place, by a share.
+
+    Args:
+        rows: of the entity, that all others belong to.
+    """
     for name, value in target.items():
-        parameter, now = entity.get_parameter(name), getattr(drawn, name)
+        parameter = entity.get_parameter(name)
         if parameter.requires_grad:
-            parameter.add_(share.reshape(-1, *[1] * (value.ndim - 1)) * (value - now))
+            weight = share.reshape(-1, *[1] * (value.ndim - 1))
+            parameter[rows] += weight * (value - getattr(drawn, name))
 
 
 # When, in a training, what no frame shows is filled in.
@@ -440,8 +426,19 @@ class Filling:
         self.hidden: dict[str, Float[Tensor, " N"]] = {}
 
     def spare(self, model: SceneModel) -> None:
-        """Scale gradients of hidden Gaussians, before a step of the optimizer."""
-        spare_hidden(model, self.hidden)
+        """Scale the gradients of Gaussians by how much of them is kept, before a step of the
+        optimizer.
+
+        Where density control has changed the number of an entity's Gaussians since, they stay.
+        """
+        for name, kept in self.hidden.items():
+            entity = model.entity(name)
+            if len(entity) != len(kept):
+                continue
+            for field in FIELDS:
+                gradient = entity.get_parameter(field).grad
+                if gradient is not None:
+                    gradient.mul_(kept.reshape(-1, *[1] * (gradient.ndim - 1)))
 
     def after(self, step: int, model: SceneModel, clip: Clip) -> None:
         """Fill in what is due after a step."""

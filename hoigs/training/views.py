@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, Frame
 from hoigs.training.losses import Crop, crop_around
 
@@ -34,10 +33,6 @@ class TrainingView:
         placed = replace(placed, image=placed.image.contiguous(), moment=frame.moment)
         found = {name: crop_around(frame, name, placed) for name in frame.masks}
         return TrainingView(placed, {name: crop for name, crop in found.items() if crop})
-
-    @property
-    def camera(self) -> Camera:
-        return self.frame.camera
 
     def nbytes(self) -> int:
         """Of its pixels."""

@@ -6,7 +6,8 @@ import json
 from dataclasses import replace
 
 import pytest
-from small_clip import Pictures, small_clip
+from recorded import Recorded
+from small_clip import small_clip
 
 from hoigs.core.clip_folder.write import write_clip
 from hoigs.core.values.clip import uniform_test_split
@@ -17,7 +18,7 @@ from hoigs.core.values.moment import Moment
 def test_a_clip_without_test_frames(hoigs, tmp_path, frames):
     clip = small_clip()
     short = replace(
-        clip, store=Pictures([clip.store.image(i) for i in range(frames)]),
+        clip, store=Recorded([clip.store.image(i) for i in range(frames)]),
         cameras=clip.cameras[:frames], moments=[Moment(float(i), i) for i in range(frames)],
         split=uniform_test_split(frames),
     )  # fmt: skip

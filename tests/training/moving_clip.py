@@ -7,30 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from recorded import Recorded
 from torch import Tensor
 
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack
+from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.synthesis import SceneConfig
 from hoigs.synthesis.object_motions import MOTIONS
-
-
-class Recorded(FrameStore):
-    def __init__(self, images: list[Tensor], masks: Mapping[str, list[Tensor]]) -> None:
-        self.images, self.masks = images, masks
-
-    def image(self, position: int) -> Tensor:
-        return self.images[position]
-
-    def mask(self, entity: str, position: int) -> Tensor:
-        return self.masks[entity][position]
-
-    def depth(self, position: int) -> Tensor | None:
-        del position
-        return None
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 
 import torch
-from torch import Tensor
+from recorded import Recorded
 
 from hoigs.core.model.entity import Entity
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import BodyTrack, Clip, FrameStore
+from hoigs.core.values.clip import BodyTrack, Clip
 from hoigs.core.values.gaussians import SH_C0, Gaussians
 from hoigs.core.values.moment import BodyPose, Moment
 from hoigs.plugins.bodies.anny import AnnyBody
@@ -19,21 +19,6 @@ from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
 SIZE, FRAMES, POINTS = 48, 5, 3500
-
-
-class Shots(FrameStore):
-    def __init__(self, images: list[Tensor], masks: list[Tensor]) -> None:
-        self.images, self.masks = images, masks
-
-    def image(self, position: int) -> Tensor:
-        return self.images[position]
-
-    def mask(self, entity: str, position: int) -> Tensor:
-        return self.masks[position]
-
-    def depth(self, position: int) -> Tensor | None:
-        del position
-        return None
 
 
 def painted() -> SceneModel:
@@ -80,7 +65,7 @@ def portrait() -> tuple[SceneModel, Clip]:
         images.append((255 * color.clamp(0, 1)).round().to(torch.uint8))
         masks.append(alpha > 0.5)
     clip = Clip(
-        "portrait", Shots(images, masks), cameras, moments,
+        "portrait", Recorded(images, {"human": masks}), cameras, moments,
         kinds={"human": "human"}, bodies={"human": BodyTrack("body:anny", track)}, objects={},
         points=torch.zeros(0, 3), point_colors=torch.zeros(0, 3),
         split={"train": list(range(FRAMES)), "test": []},

@@ -5,30 +5,15 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
+from recorded import Recorded
 
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.clip import Clip
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import Moment
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 
 SIZE, FRAMES = 64, 6
-
-
-class Pictures(FrameStore):
-    def __init__(self, images: list[Tensor]) -> None:
-        self.images = images
-
-    def image(self, position: int) -> Tensor:
-        return self.images[position]
-
-    def mask(self, entity: str, position: int) -> Tensor:
-        raise KeyError(entity)
-
-    def depth(self, position: int) -> Tensor | None:
-        del position
-        return None
 
 
 def truth(count: int = 220) -> Gaussians:
@@ -55,7 +40,7 @@ def small_clip() -> Clip:
     points = scene.means[rows] + 0.05 * torch.randn(60, 3, generator=generator)
     return Clip(
         "small",
-        Pictures(images),
+        Recorded(images),
         cameras,
         [Moment(i / (FRAMES - 1), i) for i in range(FRAMES)],
         points=points,

@@ -8,7 +8,7 @@ from matched import matched, score
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.interfaces.density import DensityControl
 from hoigs.core.model.compose import compose, compose_density
-from hoigs.core.spec.files import builtin_summary
+from hoigs.core.spec.files import builtin_specs, builtin_summary
 from hoigs.core.spec.schema import Spec
 from hoigs.core.spec.train_schema import RatesSpec
 from hoigs.core.values.moment import Moment
@@ -150,7 +150,7 @@ def test_hypernerf(native):
     assert field.config.ambient == 2 and field.coordinates.out_features == 2
 
 
-@pytest.mark.parametrize("name", [n for n in SMALL if n.endswith("-gs")])
+@pytest.mark.parametrize("name", [n for n in builtin_specs() if n.endswith("-gs")])
 def test_compositions_say_what_they_are(name):
     assert "in the spirit of" in builtin_summary(name)
     assert "not a reproduction" in builtin_summary(name)

@@ -76,7 +76,8 @@ def test_moments_follow_their_rows(control: DensityControl, moves: bool) -> None
     model, adam = model_and_adam(moves)
     entity, kept = model.entity("scene"), Kept(control)
     density = EntityDensity(entity, kept, extent=100.0)  # all are small: clones
-    density.gather(torch.rand(COUNT, 2), torch.ones(COUNT), 64, 64, None, torch.tensor(0.3))
+    loss = torch.tensor(0.3)
+    density.statistics.add(torch.rand(COUNT, 2), torch.ones(COUNT), 64, 64, loss=loss)
     before = moments(adam)
     assert density.refine(entity(MOMENT).detach(), adam, 100, 1000)
     change = kept.decision.change

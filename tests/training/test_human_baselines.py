@@ -8,7 +8,6 @@ from matched import matched
 
 from hoigs.core.model.compose import compose, compose_density
 from hoigs.core.model.scene import SceneModel
-from hoigs.core.spec.files import builtin_summary
 from hoigs.core.spec.schema import Spec
 from hoigs.core.values.clip import Clip
 from hoigs.metrics.psnr import psnr
@@ -141,12 +140,6 @@ def test_d2nerf_sorts_gaussians(clip):
     assert spec.train.loss.regularizers["entropy"] * ramp.item() == pytest.approx(1e-4)
     field.set_progress(1.0)
     torch.testing.assert_close(field.regularizers()["entropy"], field.entropy())
-
-
-@pytest.mark.parametrize("name", [n for n in SMALL if n.endswith("-gs")])
-def test_compositions_say_what_they_are(name):
-    assert "in the spirit of" in builtin_summary(name)
-    assert "not a reproduction" in builtin_summary(name)
 
 
 @pytest.mark.parametrize("name", SMALL)

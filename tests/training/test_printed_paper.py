@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import pytest
 import torch
-from portrait import SIZE, Shots, portrait
+from portrait import SIZE, portrait
+from recorded import Recorded
 from torch import Tensor
 
 from hoigs.core.model.compose import compose
@@ -32,7 +33,7 @@ SMALL = (
 )
 
 
-class Shared(Shots):
+class Shared(Recorded):
     """The portrait's pictures with a cup beside the face, and depth."""
 
     def mask(self, entity: str, position: int) -> Tensor:
@@ -55,7 +56,7 @@ def drinking() -> Clip:
         torch.tensor([0.1, 0.65, 0.15]).expand(frames, 3).clone(),
         torch.ones(frames, dtype=torch.bool),
     )
-    assert isinstance(clip.store, Shots)
+    assert isinstance(clip.store, Recorded)
     return replace(
         clip,
         store=Shared(clip.store.images, clip.store.masks),

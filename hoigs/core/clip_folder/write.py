@@ -37,6 +37,7 @@ from hoigs.core.system.files import failures_named
 from hoigs.core.system.safe_replace import refuse_unwritable, require_replaceable
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import BodyTrack, Clip, ObjectTrack, uniform_test_split
+from hoigs.core.values.moment import POSE
 from hoigs.core.values.world import World
 
 # PixelFiles writes what a clip folder has of each frame: image, masks, depth, and the cameras.
@@ -133,20 +134,15 @@ def save_body(path: Path, track: BodyTrack) -> None:
     if poses.betas.dim() != 1:
         raise ClipError(f"betas have shape {list(poses.betas.shape)}; a clip shares one [B]")
     # numpy declares these keywords as its own options
-    special: dict[str, Any] = {}
+    parts: dict[str, Any] = {}
     if track.gender is not None:
-        special["gender"] = np.array(track.gender)
+        parts["gender"] = np.array(track.gender)
     if track.template is not None:
-        special["template"] = as_array(track.template)
+        parts["template"] = as_array(track.template)
+    parts |= {f: as_array(getattr(poses, f)) for f in (*POSE, "betas")}
     np.savez_compressed(
         path,
-        **special,
-        global_orient=as_array(poses.global_orient),
-        body=as_array(poses.body),
-        left_hand=as_array(poses.left_hand),
-        right_hand=as_array(poses.right_hand),
-        transl=as_array(poses.transl),
-        betas=as_array(poses.betas),
+        **parts,
         hand_pose_convention=np.array(poses.hand_pose_convention),
         model=np.array(track.model),
         provenance=np.array(track.provenance),

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hoigs.core.device import constant
-from hoigs.core.errors import RenderError
+from hoigs.core.errors import RenderError, class_name
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.rasterizer import Rasterizer
@@ -170,10 +170,10 @@ class DensityControl(Configurable, ABC):
 def check_rasterizer(control: DensityControl, rasterizer: Rasterizer | type[Rasterizer]) -> None:
     """Raise RenderError when `control` needs gradients that `rasterizer` does not compute."""
     if control.absolute_gradients and not rasterizer.capabilities.absolute_gradients:
-        name = rasterizer.__name__ if isinstance(rasterizer, type) else type(rasterizer).__name__
         raise RenderError(
-            f"{type(control).__name__} needs absolute screen gradients, which {name} does "
-            "not compute; use rasterizer:warp, or density:adc, which does not need them"
+            f"{type(control).__name__} needs absolute screen gradients, which "
+            f"{class_name(rasterizer)} does not compute; use rasterizer:warp, or density:adc, "
+            "which does not need them"
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor, nn
 
+from hoigs.core.errors import class_name
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.interfaces.deformation import DeformationModel
 from hoigs.core.parameters import TimeRows
@@ -70,14 +71,11 @@ def check_provided(
     missing = features.requires - deformation.provides
     if missing:
         raise ValueError(
-            f"{_name(features)} requires {', '.join(sorted(missing))}, but {_name(deformation)} "
-            f"provides {', '.join(sorted(deformation.provides)) or 'nothing'}: leave the features "
-            "out (features: null), or take a deformation that provides it"
+            f"{class_name(features)} requires {', '.join(sorted(missing))}, but "
+            f"{class_name(deformation)} provides "
+            f"{', '.join(sorted(deformation.provides)) or 'nothing'}: leave the features out "
+            "(features: null), or take a deformation that provides it"
         )
-
-
-def _name(part: object) -> str:
-    return part.__name__ if isinstance(part, type) else type(part).__name__
 
 
 @runtime_checkable

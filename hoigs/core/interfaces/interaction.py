@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 from torch import nn
 
+from hoigs.core.errors import class_name
 from hoigs.core.interfaces.configurable import Configurable
 from hoigs.core.interfaces.features import FeatureExtractor
 from hoigs.core.values.tokens import EntityKind, Residual, Role, TokenKind, Tokens
@@ -64,10 +65,8 @@ def check_tokens(
     needed, given = interaction.tokens.get(kind, "any"), features.tokens
     if "any" in (needed, given) or needed == given:
         return
-    own, others = (p.__name__ if isinstance(p, type) else type(p).__name__
-                   for p in (interaction, features))  # fmt: skip
     raise ValueError(
-        f"{own} needs a token {WORDS[needed]} of each {kind}, and {others} gives one "
-        f"{WORDS[given]}: take other features, leave them out (features: null), or take another "
-        "interaction"
+        f"{class_name(interaction)} needs a token {WORDS[needed]} of each {kind}, and "
+        f"{class_name(features)} gives one {WORDS[given]}: take other features, leave them out "
+        "(features: null), or take another interaction"
     )

@@ -56,13 +56,11 @@ def sample_planes(
     return sampled.unflatten(0, (count, -1)).transpose(0, 1).flatten(1)
 
 
-def axis_pairs(
-    points: Float[Tensor, "N 3"], axes: tuple[tuple[int, int], ...] = SPACE_AXES
-) -> Float[Tensor, "P N 2"]:
-    """Two coordinates of each point for each plane."""
+def axis_pairs(points: Float[Tensor, "N 3"]) -> Float[Tensor, "3 N 2"]:
+    """Two coordinates of each point for each space plane."""
     xyz = points.unbind(1)
-    chosen = torch.stack([xyz[axis] for pair in axes for axis in pair])
-    return chosen.unflatten(0, (len(axes), 2)).mT
+    chosen = torch.stack([xyz[axis] for pair in SPACE_AXES for axis in pair])
+    return chosen.unflatten(0, (len(SPACE_AXES), 2)).mT
 
 
 def timed_pairs(

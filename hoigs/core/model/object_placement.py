@@ -29,6 +29,7 @@ from hoigs.core.values.clip import ObjectTrack
 Reduce = Literal["median", "mean"]
 Frames = Literal["whole", "all"]
 
+CELLS = 24  # across the grid in which the front of an object is found
 SMOOTHED = 7  # frames that the smoothing of an object's places looks at
 HALF_ALPHA = (2 * math.log(2)) ** 0.5  # standard deviations at which a Gaussian is at one half
 
@@ -250,7 +251,7 @@ def _middle(values: Float[Tensor, " N"]) -> float:
     return float(ordered[cut : len(values) - cut].mean())
 
 
-def seen_middle(turned: Float[Tensor, "P 3"], cells: int = 24) -> Float[Tensor, " 3"]:
+def seen_middle(turned: Float[Tensor, "P 3"]) -> Float[Tensor, " 3"]:
     """The place that mask and masked depth give an object, relative to its centre, in its own unit.
 
     The mask's centroid is that of the silhouette, and depth sees the front: on a ball that is two
@@ -260,12 +261,12 @@ def seen_middle(turned: Float[Tensor, "P 3"], cells: int = 24) -> Float[Tensor, 
         turned: about the centre, in camera axes.
     """
     low, high = turned[:, :2].amin(0), turned[:, :2].amax(0)
-    step = ((high - low) / (cells - 1)).clamp_min(1e-9)
+    step = ((high - low) / (CELLS - 1)).clamp_min(1e-9)
     at = ((turned[:, :2] - low) / step).round().long()
-    nearest = turned.new_full((cells * cells,), torch.inf)
-    nearest.scatter_reduce_(0, at[:, 1] * cells + at[:, 0], turned[:, 2], "amin")
+    nearest = turned.new_full((CELLS * CELLS,), torch.inf)
+    nearest.scatter_reduce_(0, at[:, 1] * CELLS + at[:, 0], turned[:, 2], "amin")
     filled = torch.isfinite(nearest).nonzero().squeeze(1)
-    across = low + step * torch.stack((filled % cells, filled // cells), 1).to(turned).mean(0)
+    across = low + step * torch.stack((filled % CELLS, filled // CELLS), 1).to(turned).mean(0)
     return torch.cat((across, turned.new_tensor([_middle(nearest[filled])])))
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import accumulate
 
 import torch
 from torch import Tensor, nn
@@ -50,12 +52,7 @@ class SceneState:
     def slices(self, only: Iterable[str] | None = None) -> dict[str, slice]:
         """Rows of each entity in `joined(only)`."""
         names = set(self.gaussians if only is None else only)
-        rows, start = {}, 0
-        for name, gaussians in self.gaussians.items():
-            if name in names:
-                rows[name] = slice(start, start + len(gaussians))
-                start += len(gaussians)
-        return rows
+        return _rows({n: len(g) for n, g in self.gaussians.items() if n in names})
 
 
 class SceneModel(nn.Module):
@@ -142,6 +139,15 @@ class SceneModel(nn.Module):
     def names(self, kind: str | None = None) -> list[str]:
         """Names of all entities, or of those of a kind: "scene", "human" or "object"."""
         return [n for n in self.entities if kind is None or self.entity(n).kind == kind]
+
+    @contextmanager
+    def interacting(self, enabled: bool) -> Iterator[None]:
+        """`interaction_enabled` in the block only."""
+        before, self.interaction_enabled = self.interaction_enabled, enabled
+        try:
+            yield
+        finally:
+            self.interaction_enabled = before
 
     @property
     def device(self) -> torch.device:
@@ -301,6 +307,10 @@ class SceneModel(nn.Module):
         """The number of Gaussians of each entity."""
         return {name: len(self.entity(name)) for name in self.entities}
 
+    def rows(self) -> dict[str, slice]:
+        """Rows of each entity in the Gaussians of all, as `SceneState.joined` has them."""
+        return _rows(self.count())
+
     def _repr_html_(self) -> str:
         rows = []
         for name in self.entities:
@@ -315,3 +325,8 @@ class SceneModel(nn.Module):
             drawn += f", decoded by {type(self.decoder).__name__}"
         columns = ("entity", "kind", "Gaussians", "parameters", "deformation", "features")
         return html_table(f"SceneModel: {drawn}", columns, rows)
+
+
+def _rows(counts: Mapping[str, int]) -> dict[str, slice]:
+    ends = accumulate(counts.values())
+    return {n: slice(e - count, e) for (n, count), e in zip(counts.items(), ends, strict=True)}

@@ -22,6 +22,7 @@ from hoigs.core.values.moment import BodyPose, HandConvention
 # of a hand's 15 joints, in SMPL-X's order: the first joint of index, middle, pinky, ring, thumb.
 # SMPL turns a hand as one block at its knuckles; thumbs stand elsewhere and are part of the block.
 KNUCKLES = (0, 3, 6, 9, 12)
+OFF = 0.005  # metres
 ANOTHER_PERSON = 3.0  # in standard deviations of people, which betas count
 
 
@@ -119,13 +120,11 @@ def moved_pose(
 
 
 @torch.no_grad()
-def betas_of_joints(
-    body: BodyModel, joints: Float[Tensor, "22 3"], tolerance: float = 0.005
-) -> Float[Tensor, " B"]:
+def betas_of_joints(body: BodyModel, joints: Float[Tensor, "22 3"]) -> Float[Tensor, " B"]:
     """The shape whose zero-pose body joints are these, by least squares; their place is free.
 
     Raises:
-        ClipError: some joint stays more than `tolerance` metres off: another model or gender.
+        ClipError: some joint stays more than OFF metres off: another model or gender.
     """
     zeros = torch.zeros(body.num_betas, dtype=torch.float64)
     shapes = torch.cat((zeros[None], torch.eye(body.num_betas, dtype=torch.float64)))
@@ -135,7 +134,7 @@ def betas_of_joints(
     target = joints.double() - joints[0].double() - base
     betas = torch.linalg.lstsq(moves.flatten(1).T, target.flatten()[:, None]).solution[:, 0]
     off = float((torch.einsum("b,bja->ja", betas, moves) - target).norm(dim=-1).max())
-    if off > tolerance:
+    if off > OFF:
         raise ClipError(
             f"zero-pose joints are not this model's: one is {1000 * off:.0f} mm off whatever the "
             "shape; is it the right model, and the right gender?"

@@ -116,17 +116,17 @@ def stops_raised_again() -> Iterator[None]:
 
 
 @contextmanager
-def limited(what: str, block: str | None, seconds: float | None = None) -> Iterator[None]:
+def limited(what: str, block: str | None) -> Iterator[None]:
     """Raise TooLong in an import that does not end, and name it on stderr before that.
 
     Python can end what waits or loops in the main thread. Elsewhere, and in compiled code that
-    does not return, `what` is named, and the rest is left to the user.
+    does not return, `what` is named, and the rest is left to the user. $HOIGS_IMPORT_TIMEOUT says
+    after how many seconds; else 60.
 
     Args:
         what: is imported. block: the value of HOIGS_BLOCK that leaves it out, if one does.
-        seconds: by default $HOIGS_IMPORT_TIMEOUT, or 60.
     """
-    seconds = seconds or _timeout()
+    seconds = _timeout()
     advice = f"HOIGS_BLOCK={block} leaves it out, " if block else ""
     advice += "HOIGS_IMPORT_TIMEOUT=SECONDS waits longer"
 

@@ -13,7 +13,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from contextlib import nullcontext, redirect_stdout
+from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import metadata
@@ -381,12 +381,10 @@ def _settle_key(key: str, offers: list[Offer]) -> None:
 
 def _origin(entry: metadata.EntryPoint) -> tuple[str, str]:
     """Distribution and version of an entry point; "unknown" where its metadata is damaged."""
-    try:
+    with suppress(Exception):  # what a damaged METADATA raises differs between versions of Python
         dist = entry.dist
         if dist is not None:
             return str(dist.name or "unknown"), str(dist.version or "unknown")
-    except Exception:  # what a damaged METADATA raises differs between versions of Python
-        return "unknown", "unknown"
     return "unknown", "unknown"
 
 

@@ -263,7 +263,7 @@ def _is_stale(holder: dict[str, Any], age: float) -> bool:
         return age > STALE_S
     if pid == here["pid"]:  # this process itself, or one that had its number before
         return holder.get("token") not in _HELD
-    if not _alive(pid):
+    if not alive(pid):
         return True
     began = _began(pid)
     # the number may have gone to another process since
@@ -280,12 +280,13 @@ def _this_process() -> dict[str, Any]:
     return {"pid": number, "host": socket.gethostname(), "pids": pids, "began": _began(number)}
 
 
-def _alive(pid: int) -> bool:
+def alive(pid: int) -> bool:
+    """Whether a process of this number runs on this machine."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except PermissionError:
+    except PermissionError:  # it is another user's
         return True
     return True
 

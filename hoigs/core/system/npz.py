@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -43,17 +44,12 @@ def array_headers(path: Path) -> dict[str, ArrayHeader]:
         FileNotFoundError: there is no such file.
         ValueError: not an npz, damaged, or holding pickled objects.
     """
-    try:
-        with zipfile.ZipFile(regular_file(path)) as archive:
-            found = {}
-            for name in archive.namelist():
-                with archive.open(name) as file:
-                    found[name.removesuffix(".npy")] = _header(file, name)
-            return found
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # zipfile, zlib, numpy and EOF errors all mean the same here
-        raise _unreadable("npz", error) from error
+    found = {}
+    with _readable("npz"), zipfile.ZipFile(regular_file(path)) as archive:
+        for name in archive.namelist():
+            with archive.open(name) as file:
+                found[name.removesuffix(".npy")] = _header(file, name)
+    return found
 
 
 def holds(path: Path, names: Collection[str]) -> bool:
@@ -74,17 +70,10 @@ def load_arrays(path: Path, only: Collection[str] | None = None) -> dict[str, np
         FileNotFoundError: there is no such file.
         ValueError: not an npz, damaged, holding pickled objects, or far larger than its file.
     """
-    try:
-        with zipfile.ZipFile(regular_file(path)) as archive:
-            names = [
-                n for n in archive.namelist() if only is None or n.removesuffix(".npy") in only
-            ]
-            _check_size(path, sum(archive.getinfo(name).file_size for name in names))
-            return {name.removesuffix(".npy"): _member(archive, name) for name in names}
-    except FileNotFoundError:
-        raise
-    except Exception as error:  # zipfile, zlib, numpy and EOF errors all mean the same here
-        raise _unreadable("npz", error) from error
+    with _readable("npz"), zipfile.ZipFile(regular_file(path)) as archive:
+        names = [n for n in archive.namelist() if only is None or n.removesuffix(".npy") in only]
+        _check_size(path, sum(archive.getinfo(name).file_size for name in names))
+        return {name.removesuffix(".npy"): _member(archive, name) for name in names}
 
 
 def load_array(path: Path) -> np.ndarray:
@@ -94,17 +83,20 @@ def load_array(path: Path) -> np.ndarray:
         FileNotFoundError: there is no such file.
         ValueError: not an npy, damaged, or holding pickled objects.
     """
+    with _readable("npy"), regular_file(path).open("rb") as file:
+        return _array(file, path.name, path.stat().st_size)
+
+
+@contextmanager
+def _readable(what: str) -> Iterator[None]:
+    """ValueError for all that reading raises, but for a file that is not there."""
     try:
-        with regular_file(path).open("rb") as file:
-            return _array(file, path.name, path.stat().st_size)
+        yield
     except FileNotFoundError:
         raise
-    except Exception as error:
-        raise _unreadable("npy", error) from error
-
-
-def _unreadable(what: str, error: Exception) -> ValueError:
-    return ValueError(f"not a readable {what} without pickled objects ({plain_reason(error)})")
+    except Exception as error:  # zipfile, zlib, numpy and EOF errors all mean the same here
+        reason = plain_reason(error)
+        raise ValueError(f"not a readable {what} without pickled objects ({reason})") from error
 
 
 def plain_reason(error: Exception) -> str:

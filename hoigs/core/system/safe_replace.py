@@ -35,18 +35,19 @@ class Layout:
     def missing(self, folder: Path) -> list[str]:
         return [name for name in self.required if not (folder / name).exists()]
 
-    def foreign(self, folder: Path) -> Iterator[str]:
-        """Paths inside that hoigs does not write; of a foreign folder, its own path alone."""
-        return self._foreign(folder, "")
+    def foreign(self, folder: Path, place: str = "") -> Iterator[str]:
+        """Paths inside that hoigs does not write; of a foreign folder, its own path alone.
 
-    def _foreign(self, folder: Path, place: str) -> Iterator[str]:
+        Args:
+            place: what paths begin with.
+        """
         for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
             path = place + entry.name
             if not entry.is_dir(follow_symlinks=False):
                 if not self.files.fullmatch(path):
                     yield path
             elif self.folders.fullmatch(path):
-                yield from self._foreign(folder / entry.name, f"{path}/")
+                yield from self.foreign(folder / entry.name, f"{path}/")
             else:
                 yield f"{path}/"
 

@@ -49,7 +49,10 @@ def save_tensors(tensors: Mapping[str, Tensor | TensorFile], path: Path) -> None
     Raises:
         OSError: it cannot be written.
     """
-    held = {n: t if isinstance(t, TensorFile) else _on_host(t) for n, t in tensors.items()}
+    held = {
+        n: t if isinstance(t, TensorFile) else t.detach().cpu().contiguous()
+        for n, t in tensors.items()
+    }
     order = sorted(held, key=lambda n: (-_item_size(held[n]), n))  # aligned, as the format wants
     header: dict[str, object] = {}
     at = 0
@@ -80,10 +83,6 @@ _KINDS = {
     torch.int64: "I64", torch.int32: "I32", torch.int16: "I16", torch.int8: "I8",
     torch.uint8: "U8", torch.bool: "BOOL",
 }  # fmt: skip
-
-
-def _on_host(tensor: Tensor) -> Tensor:
-    return tensor.detach().cpu().contiguous()
 
 
 def _dtype(tensor: Tensor | TensorFile) -> torch.dtype:

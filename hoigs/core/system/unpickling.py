@@ -334,9 +334,10 @@ _PLAIN = (
     "EMPTY_LIST", "LIST", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_DICT",
     "GLOBAL", "STACK_GLOBAL",
 )  # fmt: skip
+_INTEGERS = ("INT", "LONG", "LONG1", "LONG4")  # so may these, of at most 64 bits
 # Those that are done here; all others are refused.
 _OWN = (
-    "FRAME", "INT", "LONG", "LONG1", "LONG4", "BYTEARRAY8", "APPEND", "APPENDS", "SETITEM",
+    "FRAME", "BYTEARRAY8", "APPEND", "APPENDS", "SETITEM",
     "SETITEMS", "DICT", "EMPTY_SET", "ADDITEMS", "FROZENSET", "REDUCE", "BUILD",
 )  # fmt: skip
 
@@ -374,27 +375,6 @@ class Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
 
     def load_frame(self) -> None:
         self.read(8)  # its size, which says how much to read ahead; all of it is in memory
-
-    def load_int(self) -> None:
-        super().load_int()
-        self._check_bits()
-
-    def load_long(self) -> None:
-        super().load_long()
-        self._check_bits()
-
-    def load_long1(self) -> None:
-        super().load_long1()
-        self._check_bits()
-
-    def load_long4(self) -> None:
-        super().load_long4()
-        self._check_bits()
-
-    def _check_bits(self) -> None:
-        """Longer ones are no numbers of an array, and collide in dictionaries."""
-        if (bits := self.stack[-1].bit_length()) > 64:
-            raise refused(f"it holds an integer of {bits} bits; expected at most 64")
 
     def load_bytearray8(self) -> None:
         size = int.from_bytes(self.read(8), "little")
@@ -453,9 +433,22 @@ class Unpickler(_PythonUnpickler):  # type: ignore[misc]  # which is Any
         return last
 
 
-for _name in _PLAIN:
+def _of_few_bits(load: Callable[[Any], None]) -> Callable[[Any], None]:
+    """An opcode of an integer; longer ones are no numbers of an array, and collide in
+    dictionaries."""
+
+    def checked(unpickler: Any) -> None:
+        load(unpickler)
+        if (bits := unpickler.stack[-1].bit_length()) > 64:
+            raise refused(f"it holds an integer of {bits} bits; expected at most 64")
+
+    return checked
+
+
+for _name in (*_PLAIN, *_INTEGERS):
     _code = getattr(pickle, _name)[0]
-    Unpickler.dispatch[_code] = _PythonUnpickler.dispatch[_code]
+    _plain = _PythonUnpickler.dispatch[_code]
+    Unpickler.dispatch[_code] = _of_few_bits(_plain) if _name in _INTEGERS else _plain
 for _name in _OWN:
     Unpickler.dispatch[getattr(pickle, _name)[0]] = getattr(Unpickler, f"load_{_name.lower()}")
 

@@ -19,6 +19,7 @@ from typing import Any
 from hoigs.core.errors import HoigsError, did_you_mean
 from hoigs.core.system.downloads import cache_folder, made
 from hoigs.core.system.files import read_json
+from hoigs.core.system.folder_lock import alive
 
 _URL = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]+):/+(.+)$", re.DOTALL)
 # fsspec has more, some of which read other addresses, mount archives or render templates that a
@@ -299,12 +300,7 @@ def _is_pinned(entry: Path) -> bool:
             if time.time() - pin.stat().st_mtime < PIN_S:
                 return True
             continue
-        try:
-            os.kill(int(pid), 0)
-        except ProcessLookupError:
-            pin.unlink(missing_ok=True)
-        except PermissionError:  # it lives, and is another user's
+        if alive(int(pid)):
             return True
-        else:
-            return True
+        pin.unlink(missing_ok=True)
     return False

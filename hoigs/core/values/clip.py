@@ -376,13 +376,43 @@ class Clip:
         return max(spread, 0.5 * float(ahead.median()) if len(ahead) else 1.0)
 
 
-class ResizedStore(FrameStore):
+class OverStore(FrameStore):
+    """Another store as it is; subclasses change a part of it."""
+
+    def __init__(self, base: FrameStore) -> None:
+        self.base, self.root = base, base.root
+
+    def _at(self, position: int) -> tuple[FrameStore, int]:
+        """The store that has a frame, and the frame's position there."""
+        return self.base, position
+
+    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
+        store, place = self._at(position)
+        return store.image(place)
+
+    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
+        store, place = self._at(position)
+        return store.mask(entity, place)
+
+    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
+        store, place = self._at(position)
+        return store.depth(place)
+
+    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
+        store, place = self._at(position)
+        return store.ignored(place)
+
+    def mask_known(self, entity: str, position: int) -> bool:
+        store, place = self._at(position)
+        return store.mask_known(entity, place)
+
+
+class ResizedStore(OverStore):
     """Another store at another size: images by area, masks and depth by nearest pixel."""
 
     def __init__(self, base: FrameStore, sizes: Sequence[tuple[int, int]]) -> None:
-        self.base, self.sizes = base, sizes
-        self.root = base.root
-        self._images = PixelCache(CACHE_MB)
+        super().__init__(base)
+        self.sizes, self._images = sizes, PixelCache(CACHE_MB)
 
     def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
         return self._images.get(position, lambda: self._resized(position))
@@ -404,35 +434,21 @@ class ResizedStore(FrameStore):
         ignored = self.base.ignored(position)
         return None if ignored is None else self._nearest(ignored.float(), position) > 0.5
 
-    def mask_known(self, entity: str, position: int) -> bool:
-        return self.base.mask_known(entity, position)
-
     def _nearest(self, image: Tensor, position: int) -> Tensor:
         width, height = self.sizes[position]
         resize = torch.nn.functional.interpolate
         return resize(image[None, None], (height, width), mode="nearest-exact")[0, 0]
 
 
-class ChosenStore(FrameStore):
+class ChosenStore(OverStore):
     """Some frames of another store, in the order of `positions`."""
 
     def __init__(self, base: FrameStore, positions: Sequence[int]) -> None:
-        self.base, self.positions, self.root = base, list(positions), base.root
+        super().__init__(base)
+        self.positions = list(positions)
 
-    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
-        return self.base.image(self.positions[position])
-
-    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
-        return self.base.mask(entity, self.positions[position])
-
-    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
-        return self.base.depth(self.positions[position])
-
-    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
-        return self.base.ignored(self.positions[position])
-
-    def mask_known(self, entity: str, position: int) -> bool:
-        return self.base.mask_known(entity, self.positions[position])
+    def _at(self, position: int) -> tuple[FrameStore, int]:
+        return self.base, self.positions[position]
 
 
 def _stretched(times: tuple[float, ...]) -> FrameTimes:

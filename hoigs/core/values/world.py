@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 import torch
@@ -79,10 +79,7 @@ class World:
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "up": list(self.up), "floor": self.floor, "metres": self.metres, "known": self.known,
-            "within": self.within,
-        }  # fmt: skip
+        return asdict(self) | {"up": list(self.up)}
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> World:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from hoigs.core.model.smpl_params import KNUCKLES
-from hoigs.plugins.bodies.corrected import CorrectedBody, Layout, ModelFileConfig
+from hoigs.plugins.bodies.corrected import HANDS, CorrectedBody, Layout, ModelFileConfig
 
 _FINGERS = [f"{f}{i}" for f in ("index", "middle", "pinky", "ring", "thumb") for i in (1, 2, 3)]
 SMPLX_JOINT_NAMES = (
@@ -18,18 +18,20 @@ SMPLX_JOINT_NAMES = (
     *(f"left_{f}" for f in _FINGERS), *(f"right_{f}" for f in _FINGERS),
 )  # fmt: skip
 
-# key -> shape; V vertices, F triangles, S shape and expression directions
-_LAYOUT: Layout = {
-    "v_template": ("V", 3),
-    "f": ("F", 3),
-    "weights": ("V", 55),
-    "J_regressor": (55, "V"),
-    "posedirs": ("V", 3, 486),
-    "shapedirs": ("V", 3, "S"),
-    "kintree_table": (2, 55),
-    "hands_meanl": (45,),
-    "hands_meanr": (45,),
-}
+
+def _layout(joints: int) -> Layout:
+    """Shapes by key; V vertices, F triangles, S shape and expression directions."""
+    return {
+        "v_template": ("V", 3),
+        "f": ("F", 3),
+        "weights": ("V", joints),
+        "J_regressor": (joints, "V"),
+        "posedirs": ("V", 3, 9 * (joints - 1)),
+        "shapedirs": ("V", 3, "S"),
+        "kintree_table": (2, joints),
+    }
+
+
 _SOURCE = (
     "SMPL-X model files (SMPLX_NEUTRAL.npz, SMPLX_MALE.npz, SMPLX_FEMALE.npz) are a registered "
     "download at https://smpl-x.is.tue.mpg.de; or use body:anny, which needs no download"
@@ -47,7 +49,7 @@ class SmplxBody(CorrectedBody):
 
     Config: ClassVar = SmplxConfig
     key = "body:smplx"
-    layout = _LAYOUT
+    layout: ClassVar = {**_layout(55), **dict.fromkeys(HANDS, (45,))}
     source = _SOURCE
     names = SMPLX_JOINT_NAMES
 
@@ -71,18 +73,6 @@ PARENTS = (
 )  # fmt: skip
 # SMPL turns each hand at one joint, here the middle knuckle of a BodyPose
 LEFT_BLOCK, RIGHT_BLOCK = 22 + KNUCKLES[1], 37 + KNUCKLES[1]
-
-
-def _layout(joints: int) -> Layout:
-    return {
-        "v_template": ("V", 3),
-        "f": ("F", 3),
-        "weights": ("V", joints),
-        "J_regressor": (joints, "V"),
-        "posedirs": ("V", 3, 9 * (joints - 1)),
-        "shapedirs": ("V", 3, "S"),
-        "kintree_table": (2, joints),
-    }
 
 
 _SMPLH_SOURCE = (

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hoigs.core.config import ComponentConfig
 from hoigs.core.interfaces.initializer import training_frames
+from hoigs.core.maths.nearest import nearest
 from hoigs.core.model.object_placement import (
     Frames,
     Placement,
@@ -164,7 +165,7 @@ def align(
     track = clip.objects.get(entity)
     if track is None:
         raise ValueError(f"the clip has no track of {entity}, whose rotations are needed")
-    at = _reference(settings, clip, entity)
+    at = reference_frame(settings, clip, entity)
     metres = METRES.get(settings.unit, 1.0)
     canonical = centred(metres * points @ axes_matrix(settings.axes).mT, settings.center)
     canonical = _in_object(canonical, settings, clip, track, at)
@@ -194,12 +195,9 @@ def centred(
 
 def moving_part(track: ObjectTrack, points: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"] | None:
     """Which points belong to the moving part of an object in two parts: as the track's nearest."""
-    from scipy.spatial import cKDTree  # on use: scipy takes a while to import
-
     if track.moving is None:
         return None
-    nearest = cKDTree(track.points.double().numpy()).query(points.double().numpy())[1]
-    return track.moving[torch.from_numpy(nearest)]
+    return track.moving[nearest(points, 1, track.points)[0][:, 0]]
 
 
 def most_seen(clip: Clip, entity: str) -> int:
@@ -220,7 +218,12 @@ def most_seen(clip: Clip, entity: str) -> int:
     return best
 
 
-def _reference(settings: AlignmentConfig, clip: Clip, entity: str) -> int:
+def reference_frame(settings: PlacingConfig, clip: Clip, entity: str) -> int:
+    """The frame of `reference`.
+
+    Raises:
+        ValueError: the clip has no such frame, or the object is seen in none.
+    """
     if settings.reference is None:
         return most_seen(clip, entity)
     if settings.reference >= len(clip):
@@ -305,12 +308,9 @@ def inliers(
     Args:
         ratio: largest mean distance to the neighbours, over the median of theirs.
     """
-    from scipy.spatial import cKDTree  # on use: scipy takes a while to import
-
     if len(points) <= neighbours:
         return torch.ones(len(points), dtype=torch.bool)
-    array = points.double().numpy()
-    distances, indices = cKDTree(array).query(array, k=neighbours + 1)
-    spacing = distances[:, 1:].mean(1)
-    usual = np.median(spacing[indices[:, 1:]], axis=1)
-    return torch.from_numpy(np.asarray(spacing <= ratio * np.maximum(usual, 1e-12)))
+    indices, distances = (x.numpy() for x in nearest(points, neighbours))
+    spacing = distances.mean(1)
+    usual = np.median(spacing[indices], axis=1)
+    return torch.from_numpy(spacing <= ratio * np.maximum(usual, 1e-12))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-import tempfile
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
@@ -24,9 +23,15 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
 from hoigs.core.interfaces.initializer import ObjectInitializer
 from hoigs.core.interfaces.rasterizer import Rasterizer
+from hoigs.core.system.files import written_whole
 from hoigs.core.system.npz import load_arrays
 from hoigs.core.values.clip import Clip, ObjectTrack
-from hoigs.plugins.initializers.alignment import AlignmentConfig, PlacingConfig, align, most_seen
+from hoigs.plugins.initializers.alignment import (
+    AlignmentConfig,
+    PlacingConfig,
+    align,
+    reference_frame,
+)
 from hoigs.plugins.initializers.sds_distillation import (
     Denoiser,
     DistillationConfig,
@@ -110,9 +115,7 @@ class SdsInitializer(ObjectInitializer):
 
     def initialize(self, clip: Clip, entity: str) -> ObjectTrack:
         s = self.config
-        at = most_seen(clip, entity) if s.reference is None else s.reference
-        if at >= len(clip):
-            raise ValueError(f"reference {at}: the clip has {len(clip)} frames")
+        at = reference_frame(s, clip, entity)
         check_pipeline(s.path, s.condition)
         view = reference_view(clip, entity, at, 256)
         kept = self._cache_file(view)
@@ -180,14 +183,8 @@ class SdsInitializer(ObjectInitializer):
 def _save(path: Path, points: Float[Tensor, "P 3"], colors: Float[Tensor, "P 3"]) -> None:
     """All or nothing: written beside, then renamed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, scratch = tempfile.mkstemp(prefix=".sds-", suffix=".npz", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, points=points.numpy(), colors=colors.numpy())
-        Path(scratch).replace(path)
-    except BaseException:
-        Path(scratch).unlink(missing_ok=True)
-        raise
+    with written_whole(path, path.with_name(f".{path.stem}.{os.getpid()}.npz")) as part:
+        np.savez_compressed(part, points=points.numpy(), colors=colors.numpy())
 
 
 def _load(path: Path) -> tuple[Float[Tensor, "P 3"], Float[Tensor, "P 3"]]:

@@ -21,7 +21,7 @@ from hoigs.core.interfaces.rasterizer import Rasterizer, RenderRequest
 from hoigs.core.model.object_placement import mask_box
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip
-from hoigs.core.values.gaussians import Gaussians
+from hoigs.core.values.gaussians import FIELDS, Gaussians
 
 # Score distillation: the gradient of an image towards what a diffusion model expects.
 #
@@ -96,7 +96,6 @@ def distillation_loss(
     return 0.5 * (latents - target).square().sum() / len(images)
 
 
-FIELDS = ("means", "quats", "log_scales", "opacity_logits", "sh")
 RATES = {"quats": 5e-3, "log_scales": 5e-3, "opacity_logits": 0.05, "sh": 0.01}
 FIRST_RATE, LAST_RATE = 1e-3, 2e-5  # of the means, falling exponentially
 MARGIN = 0.2  # of the reference image is empty about the object

@@ -97,9 +97,7 @@ class SfmInitializer(ObjectInitializer):
             mask = ~shrunk(~mask, self.config.dilate)
             xy, depth = camera.project(clip.points)
             column, row = xy.floor().long().unbind(-1)
-            there = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-            there &= depth > 0
-            rows = there.nonzero().squeeze(1)
+            rows = camera.shows(xy, depth).nonzero().squeeze(1)
             if clip.depth_kind == "metric":
                 surface = clip.store.depth(i)
                 assert surface is not None

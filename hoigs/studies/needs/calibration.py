@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from hoigs.core.values.clip import Clip, Frame, FrameStore
+from hoigs.core.values.clip import Clip, Frame, FrameStore, OverStore
 from hoigs.studies.needs.search_space import (
     SCORING,
     Gain,
@@ -30,7 +30,7 @@ from hoigs.studies.needs.search_space import (
     gain,
     mean_gain,
 )
-from hoigs.studies.needs.trial import OverStore, Trial, region_of
+from hoigs.studies.needs.trial import Trial, region_of
 
 BEYOND = 0.05  # share of what is useless that is taken for a gain
 OBVIOUS = 3.0  # dB, half of the squared error: where all of that is gained, nothing is measured

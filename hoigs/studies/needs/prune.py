@@ -182,18 +182,15 @@ def removable_rows(
     """The most Gaussians of an entity, in order of sensitivity, whose removal costs at most
     `visible` dB in any region, and what it costs; by bisection, as far as the budget allows."""
     order = scores.argsort(stable=True)
-    slices, start = {}, 0
-    for entity, count in model.count().items():
-        slices[entity] = slice(start, start + count)
-        start += count
-    everything = torch.ones(start, dtype=torch.bool, device=scores.device)
+    first = model.rows()[name].start
+    everything = torch.ones(sum(model.count().values()), dtype=torch.bool, device=scores.device)
     fine, too_many, cost = 0, max(0, len(order) - KEEP) + 1, 0.0
     for _ in range(HALVINGS):
         count = (fine + too_many) // 2
         if count == fine or not validator.affordable:
             break
         subset = everything.clone()
-        subset[slices[name].start + order[:count]] = False
+        subset[first + order[:count]] = False
         drop = before.drop_to(validator.score(model, subset))
         if drop <= visible:
             fine, cost = count, drop
@@ -286,9 +283,8 @@ class Pruning:
             return
         if not self.validator.affordable:
             return
-        enabled, model.interaction_enabled = model.interaction_enabled, False
-        without = self.validator.score(model)
-        model.interaction_enabled = enabled
+        with model.interacting(False):
+            without = self.validator.score(model)
         drop = self.now.drop_to(without)
         if drop > self.visible:
             self._keep("tokens", "described entities", entities, drop,

@@ -12,7 +12,7 @@ from statistics import mean
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool
 from torch import Tensor
 
 from hoigs.core.errors import ClipError, HoigsError
@@ -21,7 +21,7 @@ from hoigs.core.model.compose import compose, compose_density, compose_objective
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.registry.registry import Registry
 from hoigs.core.spec.schema import Spec
-from hoigs.core.values.clip import Clip, Frame, FrameStore
+from hoigs.core.values.clip import Clip, Frame, FrameStore, OverStore
 from hoigs.metrics.psnr import psnr_from_mse
 from hoigs.metrics.regions import default_band, dilate, region_masks
 from hoigs.studies.needs.search_space import (
@@ -44,32 +44,6 @@ class SealedFrameError(RuntimeError):
     """A test frame was read during the choice of a model."""
 
 
-class OverStore(FrameStore):
-    """Another store as it is; subclasses change a part of it."""
-
-    def __init__(self, base: FrameStore) -> None:
-        self.base, self.root = base, base.root
-
-    def _open(self, position: int) -> FrameStore:
-        """The store that has a frame."""
-        return self.base
-
-    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
-        return self._open(position).image(position)
-
-    def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
-        return self._open(position).mask(entity, position)
-
-    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
-        return self._open(position).depth(position)
-
-    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
-        return self._open(position).ignored(position)
-
-    def mask_known(self, entity: str, position: int) -> bool:
-        return self._open(position).mask_known(entity, position)
-
-
 class SealedStore(OverStore):
     """Another store, some frames of which cannot be read.
 
@@ -81,14 +55,14 @@ class SealedStore(OverStore):
         super().__init__(base)
         self.sealed = frozenset(sealed)
 
-    def _open(self, position: int) -> FrameStore:
+    def _at(self, position: int) -> tuple[FrameStore, int]:
         if position in self.sealed:
             raise SealedFrameError(
                 f"frame {position} is a test frame, and a model may not be chosen by it: the "
                 "component that read it (an initializer, for example) may read clip.split['train'] "
                 "only"
             )
-        return self.base
+        return self.base, position
 
 
 def selection_frames(train: Sequence[int], share: float = 0.05, least: int = 3) -> list[int]:

@@ -124,11 +124,7 @@ class RunDrawing:
 
     def rows(self) -> dict[str, slice]:
         """Rows of each entity in `gaussians`."""
-        rows, start = {}, 0
-        for name, count in self.loaded.model.count().items():
-            rows[name] = slice(start, start + count)
-            start += count
-        return rows
+        return self.loaded.model.rows()
 
     def top_speed(self) -> float:
         """The speed that is drawn brightest, metres a second: percentile 99 of what moves."""
@@ -184,12 +180,8 @@ class RunDrawing:
         playback = self._playback(interaction)
         if playback.mode == "plain":
             model, device = self.loaded.model, self.loaded.model.device
-            enabled = model.interaction_enabled
-            model.interaction_enabled = interaction
-            try:
+            with model.interacting(interaction):
                 return model(moment.to(device)).joined()
-            finally:
-                model.interaction_enabled = enabled
         return playback.deform(moment, self.clip.cameras[0])
 
     def _playback(self, interaction: bool) -> Playback:
@@ -198,12 +190,8 @@ class RunDrawing:
             # small, as Playback draws them once and only its Gaussians are used here
             small = clip.cameras[0].resized(64, 64)
             views = [(clip.moments[0], small), (clip.moments[-1], small)]
-            enabled = model.interaction_enabled
-            model.interaction_enabled = interaction
-            try:
+            with model.interacting(interaction):
                 self._playbacks[interaction] = Playback(model, views)
-            finally:
-                model.interaction_enabled = enabled
         return self._playbacks[interaction]
 
     def _entity_colors(self, like: Gaussians) -> Float[Tensor, "N 3"]:

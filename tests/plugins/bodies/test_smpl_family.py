@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from toy_smplh import SMPL_JOINTS, write_smpl, write_smplh
-from toy_smplx import PARENTS, write_toy
+from toy_smplx import PARENTS, by_formulas, write_toy
 
 from hoigs.core.errors import ClipError, HoigsError
 from hoigs.core.interfaces.context import BuildContext
@@ -80,21 +79,9 @@ def test_smpl_by_its_own_formulas(files: Path) -> None:
     body = SmplBody(SmplBody.Config(path=files / "SMPL_NEUTRAL.npz")).double()
     with np.load(files / "SMPL_NEUTRAL.npz") as npz:
         file = dict(npz)
-    shaped = file["v_template"] + file["shapedirs"] @ betas.numpy()
-    joints = file["J_regressor"] @ shaped
-    turns = Rotation.from_rotvec(vector.numpy().reshape(-1, 3)).as_matrix()
-    bent = shaped + file["posedirs"] @ (turns[1:] - np.eye(3)).ravel()
     parents = [PARENTS[j] if j < 22 else (20, 21)[j == 43] for j in SMPL_JOINTS]
-    world: list[np.ndarray] = []
-    for j, parent in enumerate(parents):
-        local = np.eye(4)
-        local[:3, :3] = turns[j]
-        local[:3, 3] = joints[j] - (joints[parent] if j else 0)
-        world.append(world[parent] @ local if j else local)
-    back = np.tile(np.eye(4), (24, 1, 1))
-    back[:, :3, 3] = -joints
-    skinning = np.einsum("vj,jab->vab", file["weights"], np.stack(world) @ back)
-    vertices = np.einsum("vab,vb->va", skinning, np.c_[bent, np.ones(len(bent))])[:, :3]
+    angles = vector.numpy().reshape(-1, 3)
+    vertices, _ = by_formulas(file, betas.numpy(), angles, parents)
     pose = pose_from_smpl(vector, transl, betas)
     np.testing.assert_allclose(body(pose).vertices.numpy(), vertices + transl.numpy(), atol=3e-6)
 

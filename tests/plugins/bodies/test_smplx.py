@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
-from toy_smplx import PARENTS, toy_smplx, write_toy
+from toy_smplx import PARENTS, by_formulas, toy_smplx, write_toy
 
 from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.context import BuildContext
@@ -36,29 +35,15 @@ def random_pose(*batch: int, seed: int = 0, betas: int = 10) -> BodyPose:
 
 
 def reference(pose: BodyPose) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and joints by the formulas of SMPL-X, one joint and one matrix at a time."""
-    file = toy_smplx()
+    """Vertices and joints by the formulas of SMPL-X."""
     numbers = lambda x: x.numpy().reshape(-1, 3)  # noqa: E731
     angles = np.concatenate(
         (numbers(pose.global_orient), numbers(pose.body), np.zeros((3, 3)),
          numbers(pose.left_hand), numbers(pose.right_hand))
     )  # fmt: skip
-    rotations = Rotation.from_rotvec(angles).as_matrix()
-    shaped = file["v_template"] + file["shapedirs"][:, :, :10] @ pose.betas.numpy()
-    joints = file["J_regressor"] @ shaped
-    bent = shaped + file["posedirs"] @ (rotations[1:] - np.eye(3)).ravel()
-    world = []
-    for j, parent in enumerate(PARENTS):
-        local = np.eye(4)
-        local[:3, :3] = rotations[j]
-        local[:3, 3] = joints[j] - (joints[parent] if j else 0)
-        world.append(world[parent] @ local if j else local)
-    back = np.tile(np.eye(4), (55, 1, 1))
-    back[:, :3, 3] = -joints
-    skinning = np.einsum("vj,jab->vab", file["weights"], np.stack(world) @ back)
-    vertices = np.einsum("vab,vb->va", skinning, np.c_[bent, np.ones(len(bent))])[:, :3]
+    vertices, joints = by_formulas(toy_smplx(), pose.betas.numpy(), angles, PARENTS)
     transl = pose.transl.numpy()
-    return vertices + transl, np.stack(world)[:, :3, 3] + transl
+    return vertices + transl, joints + transl
 
 
 def test_matches_the_formulas_of_smplx(body: SmplxBody) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 PARENTS = (
     -1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 15, 15, 15,
@@ -79,3 +81,25 @@ def toy_smplx(seed: int = 0, directions: int = 20) -> dict[str, np.ndarray]:
 def write_toy(path: Path, **changes: np.ndarray) -> Path:
     np.savez(path, **{**toy_smplx(), **changes})
     return path
+
+
+def by_formulas(
+    file: dict[str, np.ndarray], betas: np.ndarray, angles: np.ndarray, parents: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and joints of a body at the origin, by the formulas of SMPL (lbs.py), one joint and
+    one matrix at a time."""
+    turns = Rotation.from_rotvec(angles).as_matrix()
+    shaped = file["v_template"] + file["shapedirs"][:, :, : len(betas)] @ betas
+    joints = file["J_regressor"] @ shaped
+    bent = shaped + file["posedirs"] @ (turns[1:] - np.eye(3)).ravel()
+    world: list[np.ndarray] = []
+    for j, parent in enumerate(parents):
+        local = np.eye(4)
+        local[:3, :3] = turns[j]
+        local[:3, 3] = joints[j] - (joints[parent] if j else 0)
+        world.append(world[parent] @ local if j else local)
+    back = np.tile(np.eye(4), (len(joints), 1, 1))
+    back[:, :3, 3] = -joints
+    skinning = np.einsum("vj,jab->vab", file["weights"], np.stack(world) @ back)
+    vertices = np.einsum("vab,vb->va", skinning, np.c_[bent, np.ones(len(bent))])[:, :3]
+    return vertices, np.stack(world)[:, :3, 3]

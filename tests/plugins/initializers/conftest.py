@@ -11,7 +11,7 @@ import torch
 import trimesh
 from torch import Tensor
 
-from hoigs.core.values.clip import Clip, FrameStore, ObjectTrack
+from hoigs.core.values.clip import Clip, FrameStore, ObjectTrack, OverStore
 from hoigs.plugins.bodies.anny import AnnyBody
 from hoigs.plugins.readers.clip import ClipFolderReader
 from hoigs.synthesis import SceneConfig, builtin_clip
@@ -40,11 +40,12 @@ class Truth:
         return torch.from_numpy(nearest)
 
 
-class NoTestFrames(FrameStore):
+class NoTestFrames(OverStore):
     """A store that refuses the pixels of frames that are kept for tests."""
 
     def __init__(self, base: FrameStore, kept: set[int]) -> None:
-        self.base, self.kept = base, kept
+        super().__init__(base)
+        self.kept = kept
 
     def _allowed(self, position: int) -> int:
         assert position not in self.kept, f"an initializer looked at test frame {position}"

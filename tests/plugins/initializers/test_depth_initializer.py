@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from hoigs.core.values.clip import Clip, FrameStore
+from hoigs.core.values.clip import Clip, OverStore
 from hoigs.plugins.initializers.alignment import inliers
 from hoigs.plugins.initializers.depth import (
     DepthInitializer,
@@ -18,17 +18,8 @@ from hoigs.plugins.initializers.depth import (
 )
 
 
-class Spoilt(FrameStore):
+class Spoilt(OverStore):
     """Depth as sensors and networks give it: holes, NaN, and pixels that fly off at edges."""
-
-    def __init__(self, base: FrameStore) -> None:
-        self.base = base
-
-    def image(self, position):
-        return self.base.image(position)
-
-    def mask(self, entity, position):
-        return self.base.mask(entity, position)
 
     def depth(self, position):
         depth = self.base.depth(position).clone()

@@ -19,7 +19,7 @@ from hoigs.evaluation.evaluate import score
 from hoigs.plugins.deformation.static import Static
 from hoigs.rasterizers.torch_tiles import TorchRasterizer
 from hoigs.training.objective import JointObjective
-from hoigs.training.trainer import Trainer
+from hoigs.training.trainer import Trainer, preview_scores
 
 
 class Counting(TorchRasterizer):
@@ -156,7 +156,8 @@ def test_previews_leave_them_out_too() -> None:
     base, *both = stores(clip, ignored)
 
     def preview(store: object) -> dict[str, float]:
-        return Trainer(model(clip), replace(clip, store=store), TrainSpec())._preview()  # type: ignore[arg-type]
+        trainer = Trainer(model(clip), replace(clip, store=store), TrainSpec())  # type: ignore[arg-type]
+        return preview_scores(trainer.clip, trainer._draw)
 
     painted, known = map(preview, both)
     assert painted and painted == known

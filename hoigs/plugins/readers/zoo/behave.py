@@ -21,7 +21,14 @@ from hoigs.core.model.smpl_params import pose_from_smplh, same_betas
 from hoigs.core.system.npz import load_arrays
 from hoigs.core.system.unpickling import load_pickle
 from hoigs.core.values.camera import Camera
-from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, ObjectTrack, uniform_test_split
+from hoigs.core.values.clip import (
+    BodyTrack,
+    Clip,
+    FrameStore,
+    ObjectTrack,
+    OverStore,
+    uniform_test_split,
+)
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.checked_files import (
@@ -396,23 +403,16 @@ class _View:
     cameras: list[Camera]
 
 
-class _Chain(FrameStore):
+class _Chain(OverStore):
     """Several stores one after the other."""
 
     def __init__(self, stores: Sequence[FrameStore], length: int) -> None:
-        self.stores, self.length, self.root = stores, length, stores[0].root
+        super().__init__(stores[0])
+        self.stores, self.length = stores, length
 
-    def image(self, position: int) -> Any:
-        return self.stores[position // self.length].image(position % self.length)
-
-    def mask(self, entity: str, position: int) -> Any:
-        return self.stores[position // self.length].mask(entity, position % self.length)
-
-    def depth(self, position: int) -> Any:
-        return self.stores[position // self.length].depth(position % self.length)
-
-    def ignored(self, position: int) -> Any:
-        return self.stores[position // self.length].ignored(position % self.length)
+    def _at(self, position: int) -> tuple[FrameStore, int]:
+        view, place = divmod(position, self.length)
+        return self.stores[view], place
 
 
 def _joined(views: Mapping[int, _View], moments: Sequence[Any], shared: dict[str, Any]) -> Clip:

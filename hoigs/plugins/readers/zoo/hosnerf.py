@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from PIL import Image
 from pydantic import Field
 from torch import Tensor
@@ -20,7 +20,7 @@ from hoigs.core.maths.rotations import axis_angle_to_matrices, matrices_to_axis_
 from hoigs.core.model.smpl_params import betas_of_joints, pose_from_smpl
 from hoigs.core.system.npz import load_array
 from hoigs.core.system.unpickling import load_pickle
-from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, uniform_test_split
+from hoigs.core.values.clip import BodyTrack, Clip, FrameStore, OverStore, uniform_test_split
 from hoigs.core.values.lens import Lens
 from hoigs.core.values.tokens import EntityKind
 from hoigs.plugins.readers.checked_files import (
@@ -273,24 +273,12 @@ def _body(folder: Path, images: Sequence[Path], rig: _Rig, smpl: Path) -> BodyTr
     )
 
 
-class _ObjectRemoved(FrameStore):
+class _ObjectRemoved(OverStore):
     """Frames whose mask of the person has the pixels of the object removed."""
-
-    def __init__(self, base: FrameStore) -> None:
-        self.base, self.root = base, base.root
-
-    def image(self, position: int) -> UInt8[Tensor, "H W 3"]:
-        return self.base.image(position)
 
     def mask(self, entity: str, position: int) -> Bool[Tensor, "H W"]:
         mask = self.base.mask(entity, position)
         return mask & ~self.base.mask("object", position) if entity == "human" else mask
-
-    def depth(self, position: int) -> Float[Tensor, "H W"] | None:
-        return self.base.depth(position)
-
-    def ignored(self, position: int) -> Bool[Tensor, "H W"] | None:
-        return self.base.ignored(position)
 
 
 def _any(image: Image.Image) -> Array:
