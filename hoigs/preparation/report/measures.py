@@ -55,8 +55,8 @@ class Measures:
         seconds: time by stage.
         registered: part of the chosen frames that have a camera; None for a static camera.
         reprojection_px: of COLMAP's points, mean; None for a static camera.
-        focal_px: of the video, as --focal has it. focal_range: shortest and longest that it may be, as shares
-            of it; None: it is given, or of structure from motion.
+        focal_px: of the video, as --focal has it. focal_range: shortest and longest that it may be,
+            as shares of it; None: it is given, or of structure from motion.
         up_known: what tells which way is up (`hoigs.core.values.world.World`). up_within: degrees
             within which it is; None: not known.
         displacement_px: of a static camera's background, at a width of 640; None if not measured.
