@@ -442,7 +442,7 @@ def _remarks(made: MadeObject, disc: bool, windows: bool) -> list[str]:
     said, confidence = [], made.confidence
     lost = (~made.track.observed).nonzero().flatten().tolist()
     if lost:
-        said.append(f"the object is not seen in {len(lost)} frames: {ranges(lost)}")
+        said.append(f"no mask places the object in {len(lost)} frames: {ranges(lost)}")
     if confidence.way == "ball" and not disc:
         said.append(f"the object: {confidence.reason}; if it is none, --set object_track=texture")
     if confidence.way == "texture and hands" and windows:
