@@ -174,14 +174,13 @@ def _what_to_do(model: Any, video: Frames) -> str:
             runs.append([number])
     longest = max(runs, key=len)
     seconds = video.times[order[longest[-1]]] - video.times[order[longest[0]]]
-    part = (
-        f"; --start {longest[0]}f --end {longest[-1] + 1}f uses the longest part of them, "
-        f"{seconds:.1f} s"
-    )
-    return (
-        f"Frames {ranges(known)} of the video have one{part * (seconds >= SHORTEST)}. "
-        "To have more: "
-    )
+    said = f"Frames {ranges(known)} of the video have one"
+    if seconds >= SHORTEST:
+        said += (
+            f"; --start {longest[0]}f --end {longest[-1] + 1}f uses the longest part of them, "
+            f"{seconds:.1f} s"
+        )
+    return f"{said}. To have more: "
 
 
 def _copy(database: Path | None, name: Path | None = None) -> Path:
