@@ -68,7 +68,7 @@ PLAN = {
         3,
         ("frames", "estimates"),
         ("camera", "focal", "intrinsics", "calibration", "keep_borders"),
-        version=5,
+        version=6,
     ),
     "people": Stage(
         46,

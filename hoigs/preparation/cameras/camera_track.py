@@ -20,6 +20,7 @@ from hoigs.preparation.video.frames import Frames
 from hoigs.preparation.video.source import SourceError, frame_number
 
 CameraKind = Literal["static", "turning", "moving"]
+FARTHEST = 1000.0  # times the usual distance: points beyond it are at infinity
 ASSUMED_FOCAL = 0.8  # of the longer side: 64 degrees, a phone's main camera
 
 
@@ -161,6 +162,7 @@ def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> Came
     shift = lens.undistortion((video.width, video.height)).shift
     cameras = [_camera(image, K, video) for image in images]
     points = [p for p in model_read.points3D.values() if p.track.length() >= 3]
+    points = _within_reach(points, torch.stack([camera.center for camera in cameras]).mean(0))
     if not points:
         raise SourceError(f"{model} has no points seen by three images or more")
     off = float(model_read.compute_mean_reprojection_error())
@@ -187,6 +189,14 @@ def colmap_cameras(video: Frames, model: Path, *, partial: bool = False) -> Came
             "distortion_px": round(shift, 3),
         },
     )
+
+
+def _within_reach(points: list[Any], middle: Float[Tensor, "3"]) -> list[Any]:
+    """Without points that are FARTHEST times as far away as most: their rays are parallel, and how
+    far away they are is noise without a bound."""
+    away = [float(np.linalg.norm(p.xyz - middle.numpy())) for p in points]
+    most = FARTHEST * float(np.median(away)) if away else 0.0
+    return [p for p, far in zip(points, away, strict=True) if far <= most]
 
 
 def _by_frame(model: Any) -> dict[int, Any]:

@@ -104,6 +104,16 @@ def test_names_with_spaces(tiny_video: Path, tmp_path: Path) -> None:
     assert places == pytest.approx([-0.1 * i for i in range(FRAMES)], abs=1e-6)
 
 
+def test_points_at_infinity_are_left_out(tiny_video: Path, tmp_path: Path) -> None:
+    """Rays that are parallel but for noise meet anywhere, also 1e15 units away."""
+    model = colmap_model(tmp_path / "sparse")
+    points = model / "points3D.txt"
+    first, *rest = points.read_text().splitlines()
+    points.write_text("\n".join([first.replace(" 4 255", " 4e15 255"), *rest]) + "\n")
+    track = colmap_cameras(VideoFrames(tiny_video), model)
+    assert track.points.shape == (9, 3) and track.points.abs().max() < 10
+
+
 def test_no_distortion_leaves_pixels_alone(tiny_video: Path, tmp_path: Path) -> None:
     track = colmap_cameras(VideoFrames(tiny_video), colmap_model(tmp_path / "sparse", k1=0.0))
     image = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)

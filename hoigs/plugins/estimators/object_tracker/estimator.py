@@ -32,6 +32,7 @@ from hoigs.plugins.estimators.object_tracker.prompts import (
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.proposal import proposed
+from hoigs.plugins.estimators.object_tracker.rod import Rod, clicked_rod, rod_followed, rod_of
 from hoigs.plugins.estimators.object_tracker.scene import (
     Scene,
     is_static,
@@ -112,7 +113,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 25  # of what is kept in `work`; raised when masks change
+VERSION = 26  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -195,9 +196,18 @@ class ObjectTrackerEstimator(Estimator):
         prompts: dict[str, list[PromptedMask]] = {}
         notes: list[str] = []
         chosen: dict[str, list[FramePrompt]] = {}
+        rods: dict[str, list[Rod]] = {}
         for entity in (e for e in wanted if e.prompts):
-            prompts[entity.name] = self._prompted(entity, footage, scene, notes)
-        looks = {n: Appearance.learnt(footage, masks_of(m)) for n, m in prompts.items() if m}
+            if held := _rods(entity, footage, scene, people):
+                rods[entity.name] = held
+                prompts[entity.name] = [clicked_rod(footage, scene, people, rod) for rod in held]
+            else:
+                prompts[entity.name] = self._prompted(entity, footage, scene, notes)
+        looks = {
+            n: Appearance.learnt(footage, masks_of(m))
+            for n, m in prompts.items()
+            if m and n not in rods
+        }
         groups = groups_of(
             prompts, {n: twins_of(k, masks_of(prompts[n])) for n, k in looks.items()}
         )
@@ -216,11 +226,14 @@ class ObjectTrackerEstimator(Estimator):
                 )
             masks, share = prompts[entity.name], 0.65 / len(wanted)
             part = _part(progress, done, share)
-            tracks[entity.name] = (
-                followed(footage, scene, masks, part, looks.get(entity.name)) if masks else None
-            )
+            if entity.name in rods:
+                tracks[entity.name] = rod_followed(footage, scene, people, rods[entity.name], part)
+            else:
+                tracks[entity.name] = (
+                    followed(footage, scene, masks, part, looks.get(entity.name)) if masks else None
+                )
             done += share
-        others = {n: [] if n in equal else masks for n, masks in prompts.items()}
+        others = {n: [] if n in equal or n in rods else masks for n, masks in prompts.items()}
         tracks, alike = told_apart(footage, scene, others, {e.name: tracks[e.name] for e in wanted})
         vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
         tracks |= dict.fromkeys(vague)
@@ -260,6 +273,24 @@ class ObjectTrackerEstimator(Estimator):
                 )
             masks.append(found)
         return masks
+
+
+def _rods(
+    entity: EntityRequest, footage: Footage, scene: Scene, people: Sequence[np.ndarray]
+) -> list[Rod]:
+    """The entity in each of its clicked frames, where it is long and thin and held in all of them;
+    else none."""
+    found = []
+    for prompt in entity.prompts:
+        click = next((np.array((p.x, p.y)) for p in prompt.points if p.inside), None)
+        i = footage.numbers.index(prompt.frame)
+        if prompt.box or click is None:
+            return []
+        rod = rod_of(footage, scene, people, i, footage.scale * click)
+        if rod is None:
+            return []
+        found.append(rod)
+    return found
 
 
 def _looks_like_scenery(scene: Scene, found: PromptedMask) -> bool:
