@@ -18,6 +18,7 @@ from hoigs.core.interfaces.estimator import (
     Estimator,
     FramePrompt,
     LazyFrames,
+    PromptPoint,
     VideoRequest,
 )
 from hoigs.core.reporting import Progress, no_progress
@@ -28,11 +29,18 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footag
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
     looks_like_person,
+    overlap,
     prompted_mask,
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.proposal import proposed
-from hoigs.plugins.estimators.object_tracker.rod import Rod, clicked_rod, rod_followed, rod_of
+from hoigs.plugins.estimators.object_tracker.proposal import proposed, sampled
+from hoigs.plugins.estimators.object_tracker.rod import (
+    Rod,
+    clicked_rod,
+    rod_followed,
+    rod_of,
+    rods_held,
+)
 from hoigs.plugins.estimators.object_tracker.scene import (
     Scene,
     is_static,
@@ -126,6 +134,7 @@ EQUAL = (
     "other things look the same, so that only its path tells which is which; where it does not, "
     "nothing is shown, and a click there or later says it"
 )
+SHARED = 0.3  # of a mask that is another object's, from which it is that
 SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 
@@ -220,7 +229,11 @@ class ObjectTrackerEstimator(Estimator):
             notes.append(f"{', '.join(group)}: {EQUAL}")
             done += share
         for entity in (e for e in wanted if e.name not in equal):
-            if not entity.prompts:
+            if not entity.prompts and (rod := _held(footage, scene, people, tracks)):
+                rods[entity.name] = [rod]
+                prompts[entity.name] = [clicked_rod(footage, scene, people, rod)]
+                chosen[entity.name] = [_taken(entity, footage, rod, notes)]
+            elif not entity.prompts:
                 prompts[entity.name], chosen[entity.name] = _proposed(
                     entity, footage, scene, people, tracks, notes
                 )
@@ -315,13 +328,40 @@ def _proposed(
             "on it (--object X,Y@FRAME, or hoigs annotate)"
         )
     else:
-        best, (point, *_) = found[0].prompt, found[0].prompt.points
-        notes.append(
-            f"{entity.name}: nothing was clicked, and what is at {point.x:g},{point.y:g} in frame "
-            f"{best.frame} was taken (object.jpg); if it is something else, click on it (--object "
-            "X,Y@FRAME, or hoigs annotate)"
-        )
+        notes.append(_not_clicked(entity, found[0].prompt))
     return [p.mask for p in found], [p.prompt for p in found]
+
+
+def _held(
+    footage: Footage,
+    scene: Scene,
+    people: Sequence[np.ndarray],
+    others: dict[str, Track | None],
+) -> Rod | None:
+    """A long and thin thing in a hand that is no other object; None where there is none."""
+    for rod in rods_held(footage, scene, people, sampled(len(footage), people)):
+        mask = clicked_rod(footage, scene, people, rod).soft > 0.5
+        taken = [t.soft[rod.frame] > 127 for t in others.values() if t is not None]
+        if mask.any() and not any(overlap(mask, other & mask) > SHARED for other in taken):
+            return rod
+    return None
+
+
+def _taken(entity: EntityRequest, footage: Footage, rod: Rod, notes: list[str]) -> FramePrompt:
+    """The click that would have given this, and a note."""
+    x, y = (round(float(v) / footage.scale) for v in rod.click)
+    prompt = FramePrompt(footage.numbers[rod.frame], (PromptPoint(x, y),))
+    notes.append(_not_clicked(entity, prompt))
+    return prompt
+
+
+def _not_clicked(entity: EntityRequest, prompt: FramePrompt) -> str:
+    point = prompt.points[0]
+    return (
+        f"{entity.name}: nothing was clicked, and what is at {point.x:g},{point.y:g} in frame "
+        f"{prompt.frame} was taken (object.jpg); if it is something else, click on it (--object "
+        "X,Y@FRAME, or hoigs annotate)"
+    )
 
 
 def _part(progress: Progress, start: float, share: float) -> Callable[[float], None]:

@@ -66,8 +66,7 @@ def proposed(
     Args:
         people: landmarks of each in the footage. taken: pixels of other objects.
     """
-    frames = with_everybody(len(footage), people)
-    frames = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, SAMPLES).astype(int))]
+    frames = sampled(len(footage), people)
     likeness = Likeness.of(footage, scene, people, frames)
     found: list[Candidate] = []
     for i in frames:
@@ -83,6 +82,12 @@ def proposed(
     known = _colors_of(footage, found, order[0], frames)
     grown = [_grown(likeness, c, known) for c in tried]
     return _spread(footage, grown)
+
+
+def sampled(count: int, people: Sequence[Float[np.ndarray, "F 33 4"]]) -> list[int]:
+    """The frames that are searched."""
+    frames = with_everybody(count, people)
+    return [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, SAMPLES).astype(int))]
 
 
 def with_everybody(count: int, people: Sequence[Float[np.ndarray, "F 33 4"]]) -> list[int]:

@@ -13,25 +13,23 @@ from dataclasses import dataclass, replace
 from math import remainder, tau
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import Footage, torso_length
+from hoigs.plugins.estimators.object_tracker.lines import BLURRED, LEAST, STEP, Fan, Line, Look
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.scene import Scene
 
 HANDS = ((15, 17, 19), (16, 18, 20))  # wrist and fingers, among MediaPipe's landmarks
-DIFFERS, STANDS_OUT = 6.0, 20.0  # units of noise and of colour that are full evidence
-HALF = 15.0  # units of colour off the thing's own at which a pixel before a body counts little
-LEAST = 0.2  # evidence of a pixel from which it lengthens a line
-STEP = 1.5  # pixels along a line
 BESIDE = (2.5, 4.0, 6.0, 9.0)  # pixels from the middle of a line to both of its sides
-BLURRED = 0.04  # and how much more for each pixel from the hand: a swing blurs the end most
 FINGERS = 0.12  # torsos from the middle of a hand, which covers what is there
 GRIP = 0.2  # torsos that a line may pass beside the middle of a hand
 BEYOND = 1.5  # torsos that a thing may be longer than from the hand to the click
 BETTER = 1.05  # times the evidence that a wider look must find
+FEWEST, OFTEN = 4, 0.25  # frames, and share of them, that show what nobody clicked
+MIDDLE = 0.6  # of a line's length: where it is clicked then
 SHORTEST, SLENDER = 0.6, 0.08  # torsos of its length; of that, half of its breadth
 SUPPORTED, CRISP = 0.75, 0.3  # share of the clicked line's pixels that differ from both sides and
 # are before no body; and how much, on average
@@ -42,112 +40,6 @@ ASIDE = 0.2  # radians between neighbours
 FASTEST = 1.2  # radians from frame to frame
 BENDS = 15  # degrees that the part of a thing beyond the hand may be off the line
 SHORTER = 0.3  # lengths of the clicked part that it has at least
-
-
-@dataclass(frozen=True)
-class Line:
-    """A piece of a line in one frame.
-
-    Attributes:
-        start: x, y beside the hand. angle: of its direction, from x to y. length: pixels.
-        evidence: summed over its pixels. support: share of its pixels that are before no
-            body and differ from both sides. color: the median of its pixels.
-    """
-
-    start: Float[np.ndarray, "2"]
-    angle: float
-    length: float
-    evidence: float
-    support: float
-    color: Float[np.ndarray, "3"]
-
-    @property
-    def direction(self) -> Float[np.ndarray, "2"]:
-        return np.array((np.cos(self.angle), np.sin(self.angle)))
-
-    def away(self, other: Line) -> float:
-        """Pixels from the other line's to this one, on average."""
-        along, aside = self.off(*other.points().T)
-        beyond = np.maximum(-along, along - self.length).clip(0)
-        return float(np.hypot(beyond, aside).mean())
-
-    def points(self) -> Float[np.ndarray, "S 2"]:
-        """x, y along it."""
-        return self.start + np.arange(0.0, self.length + STEP / 2, STEP)[:, None] * self.direction
-
-    def off(
-        self, x: Float[np.ndarray, "..."], y: Float[np.ndarray, "..."]
-    ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
-        """How far along the line pixels are, and how far to its right."""
-        dx, dy = x - self.start[0], y - self.start[1]
-        ux, uy = self.direction
-        return dx * ux + dy * uy, dy * ux - dx * uy
-
-
-@dataclass(frozen=True)
-class _Look:
-    """How lines of one frame are judged.
-
-    Attributes:
-        changed: how far pixels differ from the scene, 1 by DIFFERS units of noise or more. body:
-            pixels of people, whom the scene does not show. beside: pixels from the middle of a
-            line to its sides. reach: pixels of the longest line. color: the thing's, which tells it
-            from folds of clothes; None while it is unknown.
-    """
-
-    changed: Float[np.ndarray, "h w"]
-    body: Bool[np.ndarray, "h w"]
-    colors: Float[np.ndarray, "h w 3"]
-    beside: float
-    reach: float
-    color: Float[np.ndarray, "3"] | None
-
-    @classmethod
-    def at(
-        cls,
-        footage: Footage,
-        scene: Scene,
-        i: int,
-        beside: float,
-        reach: float,
-        color: Float[np.ndarray, "3"] | None = None,
-    ) -> _Look:
-        away = np.nan_to_num(scene.difference(i), nan=0.0)
-        changed = np.minimum(ndimage.gaussian_filter(away, 0.5), DIFFERS) / DIFFERS
-        colors = ndimage.gaussian_filter(footage.colors(i), (0.5, 0.5, 0))
-        return cls(changed, footage.body(i), colors, beside, reach, color)
-
-    def cells(self, points: Float[np.ndarray, "*N 2"]) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of points, those of the rim for points beyond it."""
-        x, y = np.moveaxis(points.astype(int), -1, 0)
-        height, width = self.body.shape
-        return y.clip(0, height - 1), x.clip(0, width - 1)
-
-    def evidence(
-        self, starts: Float[np.ndarray, "N 2"], angles: Float[np.ndarray, " N"]
-    ) -> tuple[Float[np.ndarray, "N S"], tuple[np.ndarray, np.ndarray]]:
-        """How much speaks for each pixel along lines, at most 1, and the pixels' rows and columns.
-
-        It is how much more a pixel differs from the scene than those to both sides of it do; before
-        a body, how much its colour differs from theirs, and is the thing's.
-        """
-        s = np.arange(0.0, self.reach, STEP)
-        along = np.stack((np.cos(angles), np.sin(angles)), -1)
-        across = np.stack((-along[:, 1], along[:, 0]), -1)[:, None]
-        middle = starts[:, None] + s[:, None] * along[:, None]
-        aside = (self.beside + BLURRED * s)[:, None] * across
-        here, left, right = (self.cells(middle + off) for off in (0 * aside, -aside, aside))
-        found = self.changed[here] - np.maximum(self.changed[left], self.changed[right])
-        if (before := self.body[here]).any():
-            own, one, other = (self.colors[y[before], x[before]] for y, x in (here, left, right))
-            sides = [np.linalg.norm(own - side, axis=-1) for side in (one, other)]
-            stands_out = np.minimum(np.minimum(*sides) / STANDS_OUT, 1.0)
-            if self.color is not None:
-                stands_out *= np.exp(-(((own - self.color) / HALF) ** 2).sum(-1))
-            found[before] = stands_out
-        size = np.array(self.body.shape[::-1])
-        inside = ((middle >= 0) & (middle < size)).all(-1)  # beyond it nothing is known
-        return np.where(inside, found, LEAST), here
 
 
 @dataclass(frozen=True)
@@ -171,6 +63,11 @@ class Rod:
     half: float = 0.0
     differs: float = 0.0
 
+    @property
+    def click(self) -> Float[np.ndarray, "2"]:
+        """A point x, y on it, away from the hand."""
+        return self.line.start + MIDDLE * self.line.length * self.line.direction
+
 
 def rod_of(
     footage: Footage,
@@ -184,18 +81,17 @@ def rod_of(
     Args:
         click: x, y in pixels of the footage.
     """
-    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
-    if not np.isfinite(lengths).any():
+    torso = _torso(people)
+    if torso is None:
         return None
-    torso = float(np.nanmedian(lengths))
     best: Rod | None = None
+    look = Look.at(footage, scene, frame)
     for person, landmarks in enumerate(people):
         for hand in range(len(HANDS)):
             middle = _hand(landmarks[frame], hand)
             reach = float(np.hypot(*(click - middle))) + BEYOND * torso
             for beside in BESIDE if np.isfinite(reach) else ():
-                look = _Look.at(footage, scene, frame, beside, reach)
-                line = _through(look, middle, click, torso)
+                line = _through(replace(look, beside=beside, reach=reach), middle, click, torso)
                 if line and not (best and line.evidence <= BETTER * best.line.evidence):
                     best = Rod(person, hand, frame, line, beside, torso)
     if (
@@ -206,7 +102,7 @@ def rod_of(
     ):
         return None
     line = best.line
-    look = _Look.at(footage, scene, frame, best.beside, LONGER * line.length, line.color)
+    look = replace(look, beside=best.beside, reach=LONGER * line.length, color=line.color)
     half = _half_breadth(look, line)
     if half > SLENDER * line.length:
         return None
@@ -220,15 +116,68 @@ def rod_of(
     )
 
 
+def _torso(people: Sequence[Float[np.ndarray, "F 33 4"]]) -> float | None:
+    """The usual length of a torso in pixels; None where none is seen."""
+    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
+    return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else None
+
+
 def _hand(landmarks: Float[np.ndarray, "33 4"], hand: int) -> Float[np.ndarray, "2"]:
     """The middle x, y of a hand."""
     return landmarks[list(HANDS[hand]), :2].mean(0)
 
 
-def _across(hand: Float[np.ndarray, "2"], line: Line, bend: float, torso: float) -> _Fan:
+def rods_held(
+    footage: Footage,
+    scene: Scene,
+    people: Sequence[Float[np.ndarray, "F 33 4"]],
+    frames: Sequence[int],
+) -> list[Rod]:
+    """A thing that nobody clicked, where one hand holds one in many of some frames: as these show
+    it, the clearest first."""
+    torso = _torso(people)
+    if torso is None:
+        return []
+    found: dict[tuple[int, int], list[Rod]] = {}
+    for i in frames:
+        look = Look.at(footage, scene, i)
+        look = replace(look, beside=BESIDE[-1], reach=(1 + BEYOND) * torso, on_body=False)
+        for person, landmarks in enumerate(people):
+            for hand in range(len(HANDS)):
+                click = _clearest(look, _hand(landmarks[i], hand), torso)
+                rod = None if click is None else rod_of(footage, scene, people, i, click)
+                if rod is not None and (rod.person, rod.hand) == (person, hand):
+                    found.setdefault((person, hand), []).append(rod)
+    most = max(found.values(), key=len, default=[])
+    if len(most) < max(FEWEST, OFTEN * len(frames)):
+        return []
+    usual = float(np.median([rod.line.length for rod in most]))
+    alike = [rod for rod in most if usual / LONGER < rod.line.length < usual * LONGER]
+    return sorted(alike, key=lambda rod: -rod.line.evidence)
+
+
+def _clearest(
+    look: Look, hand: Float[np.ndarray, "2"], torso: float
+) -> Float[np.ndarray, "2"] | None:
+    """A point of the line from a hand that has clearly most evidence."""
+    if not np.isfinite(hand).all():
+        return None
+    angles = np.deg2rad(np.arange(0, 360, 2.0))
+    fan = Fan.of(hand, angles, np.arange(-GRIP * torso, GRIP * torso + 0.1, 2.0))
+    each = fan.sums(look)[0].reshape(len(angles), -1).max(1)
+    a = int(each.argmax())
+    apart = np.cos(angles - angles[a]) < np.cos(2 * ASIDE)
+    opposite = np.cos(angles - angles[a]) < -np.cos(2 * ASIDE)  # may be the rest of it
+    if not each[a] > CLEAR * max(float(each[apart & ~opposite].max()), 0.0):
+        return None
+    line = fan.only(fan.angles == angles[a]).best(look)
+    return line.start + MIDDLE * line.length * line.direction
+
+
+def _across(hand: Float[np.ndarray, "2"], line: Line, bend: float, torso: float) -> Fan:
     """Lines on the other side of a hand that continue a line, `bend` radians off it."""
     angles = line.angle + np.pi + bend + np.deg2rad(np.arange(-BENDS, BENDS + 0.1, 1.0))
-    return _Fan.of(hand, angles, np.arange(-GRIP * torso, GRIP * torso + 0.1, 1.0))
+    return Fan.of(hand, angles, np.arange(-GRIP * torso, GRIP * torso + 0.1, 1.0))
 
 
 def clicked_rod(
@@ -242,67 +191,18 @@ def clicked_rod(
 
 
 def _through(
-    look: _Look, hand: Float[np.ndarray, "2"], click: Float[np.ndarray, "2"], torso: float
+    look: Look, hand: Float[np.ndarray, "2"], click: Float[np.ndarray, "2"], torso: float
 ) -> Line | None:
     """The line from a hand through a click that has most evidence."""
     to = click - hand
     far = float(np.hypot(*to))
     angles = np.arctan2(to[1], to[0]) + np.deg2rad(np.arange(-20, 20.1, 0.5))
-    fan = _Fan.of(hand, angles, np.arange(-1.5 * GRIP * torso, 1.5 * GRIP * torso + 1))
+    fan = Fan.of(hand, angles, np.arange(-1.5 * GRIP * torso, 1.5 * GRIP * torso + 1))
     near = np.abs(fan.across @ to - fan.offs) < max(3.0, 0.05 * far)
     return fan.only(near).best(look, far - 3) if near.any() else None
 
 
-@dataclass(frozen=True)
-class _Fan:
-    """Lines that begin beside a hand, by their angles and how far they pass beside its middle."""
-
-    hand: Float[np.ndarray, "2"]
-    angles: Float[np.ndarray, " N"]
-    offs: Float[np.ndarray, " N"]
-
-    @classmethod
-    def of(cls, hand: np.ndarray, angles: np.ndarray, offs: np.ndarray) -> _Fan:
-        """Each of the angles with each of the offsets."""
-        every = np.meshgrid(angles, offs, indexing="ij")
-        return cls(hand, every[0].ravel(), every[1].ravel())
-
-    def only(self, rows: Bool[np.ndarray, " N"]) -> _Fan:
-        return _Fan(self.hand, self.angles[rows], self.offs[rows])
-
-    @property
-    def across(self) -> Float[np.ndarray, "N 2"]:
-        return np.stack((-np.sin(self.angles), np.cos(self.angles)), -1)
-
-    @property
-    def starts(self) -> Float[np.ndarray, "N 2"]:
-        return self.hand + self.offs[:, None] * self.across
-
-    def best(self, look: _Look, least: float = 0.0) -> Line:
-        """The line with most evidence, which ends where evidence does, but not before `least`."""
-        total, ends = self.sums(look, least)
-        row = int(total.argmax())
-        found, (y, x) = look.evidence(self.starts[[row]], self.angles[[row]])
-        here = slice(0, int(ends[row]) + 1)
-        free = ~look.body[y[0, here], x[0, here]]
-        own = look.colors[y[0, here], x[0, here]][free]
-        return Line(
-            self.starts[row], float(self.angles[row]), STEP * float(ends[row]), float(total[row]),
-            float((found[0, here][free] > LEAST).sum() / len(free)),
-            np.median(own, 0) if len(own) else np.zeros(3),
-        )  # fmt: skip
-
-    def sums(
-        self, look: _Look, least: float = 0.0
-    ) -> tuple[Float[np.ndarray, " N"], Int[np.ndarray, " N"]]:
-        """Most evidence of each line up to any end, and the step where it ends."""
-        total = np.cumsum(look.evidence(self.starts, self.angles)[0] - LEAST, -1) * STEP
-        total[:, : int(max(least, 0) / STEP)] = -np.inf
-        ends = total.argmax(-1)
-        return total[np.arange(len(ends)), ends], ends
-
-
-def _half_breadth(look: _Look, line: Line) -> float:
+def _half_breadth(look: Look, line: Line) -> float:
     """Pixels from the middle of a line to where less than half of what differs there differs."""
     aside = np.arange(-look.beside, look.beside + 0.25, 0.5)
     across = np.array((-np.sin(line.angle), np.cos(line.angle)))
@@ -375,15 +275,16 @@ def _found_in(
     hand, known = _hand(people[rod.person][i], rod.hand), rod.line
     if not np.isfinite(hand).all():
         return []
-    look = _Look.at(footage, scene, i, rod.beside, LONGER * known.length, known.color)
+    look = Look.at(footage, scene, i)
+    look = replace(look, beside=rod.beside, reach=LONGER * known.length, color=known.color)
     coarse, grip = np.deg2rad(np.arange(0, 360, 1.0)), GRIP * rod.torso
-    fan = _Fan.of(hand, coarse, np.arange(-grip, grip + 0.1, 2.0))
+    fan = Fan.of(hand, coarse, np.arange(-grip, grip + 0.1, 2.0))
     total = fan.sums(look)[0].reshape(len(coarse), -1)
     offs, each = fan.offs.reshape(total.shape), total.max(1)
     peaks: list[Line] = []
     while len(peaks) < PEAKS and each.max() > 0:
         a = int(each.argmax())
-        fine = _Fan.of(
+        fine = Fan.of(
             hand, coarse[a] + np.deg2rad(np.arange(-1, 1.1, 0.25)),
             offs[a, total[a].argmax()] + np.arange(-1.5, 1.6, 0.5),
         )  # fmt: skip
@@ -454,7 +355,8 @@ def pixels_of(
 ) -> Bool[np.ndarray, "h w"]:
     """The pixels of a line where it is seen and, beside it, of what differs from the scene as much:
     what is broader there, and what is blurred."""
-    look = _Look.at(footage, scene, i, rod.beside, line.length + STEP, rod.line.color)
+    look = Look.at(footage, scene, i)
+    look = replace(look, beside=rod.beside, reach=line.length + STEP, color=rod.line.color)
     found, _ = look.evidence(line.start[None], np.array([line.angle]))
     seen = ndimage.median_filter(found[0], GAP, mode="nearest") > LEAST
     y, x = np.mgrid[: footage.shape[0], : footage.shape[1]] + 0.5

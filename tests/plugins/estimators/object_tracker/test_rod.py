@@ -11,7 +11,13 @@ from test_behind import footage_of
 
 from hoigs.core.interfaces.estimator import FramePrompt, Landmarks, PromptPoint
 from hoigs.plugins.estimators.object_tracker.prompts import overlap
-from hoigs.plugins.estimators.object_tracker.rod import Rod, clicked_rod, rod_followed, rod_of
+from hoigs.plugins.estimators.object_tracker.rod import (
+    Rod,
+    clicked_rod,
+    rod_followed,
+    rod_of,
+    rods_held,
+)
 from hoigs.plugins.estimators.object_tracker.scene import static_scene
 
 COUNT, CLICKED = 20, 4
@@ -125,6 +131,26 @@ def test_a_click_on_a_rod_is_enough(tmp_path: Path) -> None:
     overlaps = [overlap(mask, true[0]) for mask, true in zip(theirs, masks, strict=True)]
     assert np.mean(np.array(overlaps) > 0.5) > 0.9
     assert found.states is not None and set(found.states["object"]) <= {"seen", "lost"}
+
+
+def test_a_rod_that_nobody_clicked_is_found_in_the_hand(tmp_path: Path) -> None:
+    frames, people, masks = scene(lambda i: [swing(i)])
+    video = request(tmp_path, (frames, people, masks))
+    assert video.known is not None
+    known = replace(video.known, landmarks={"human": Landmarks(landmarks())})
+    found = masks_of(replace(video, known=known))
+    theirs = [found.entities["object"][i] for i in range(COUNT)]
+    overlaps = [overlap(mask, true[0]) for mask, true in zip(theirs, masks, strict=True)]
+    assert np.mean(np.array(overlaps) > 0.5) > 0.9
+    (prompt,) = found.chosen["object"]
+    x, y = prompt.points[0].x, prompt.points[0].y
+    assert masks[prompt.frame][0][round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3].any()
+
+
+def test_a_bare_hand_holds_no_rod() -> None:
+    frames, people, _ = scene(lambda i: [])
+    footage = footage_of(frames, people)
+    assert rods_held(footage, static_scene(footage), [landmarks()], range(COUNT)) == []
 
 
 def test_the_clicked_mask_is_that_of_its_frame() -> None:
