@@ -19,7 +19,7 @@ from hoigs.preparation.video.span import Pick, Span
 if TYPE_CHECKING:
     from hoigs.core.maths.frame_times import Chunking
 
-ObjectWay = Literal["auto", "ball", "plate", "texture", "outline"]
+ObjectWay = Literal["auto", "ball", "rod", "plate", "texture", "outline"]
 FIT_STEPS = 40  # of the body fit, at most
 # an EstimateKind, or "object": masks of the object alone (that interface loads numpy)
 Place = Literal["masks", "landmarks", "depth", "object"]
@@ -191,9 +191,11 @@ class PrepareOptions(Options):
     object_track: ObjectWay = Field(
         default="auto",
         description='how the object\'s poses are found: "ball": as those of a sphere, whose '
-        'rotation stays unknown; "plate": as those of something flat, such as a board; "texture": '
-        'from hands, outlines and texture; "outline": its place and roll only; "auto": as a ball '
-        "where its masks are round in all frames, or else by what explains held-back frames best",
+        'rotation stays unknown; "rod": as those of something long and thin that a hand holds, '
+        'whose turn about its axis stays unknown; "plate": as those of something flat, such as a '
+        'board; "texture": from hands, outlines and texture; "outline": its place and roll only; '
+        '"auto": as a ball where its masks are round in all frames, or else by what explains '
+        "held-back frames best",
     )
     object_size: float | None = Field(
         default=None,

@@ -30,6 +30,20 @@ def silhouette_ious(track: ObjectTrack, filmed: Filmed) -> Float[np.ndarray, " F
     return found
 
 
+def outline_errors(track: ObjectTrack, filmed: Filmed) -> Float[np.ndarray, " F"]:
+    """Of each frame, metres between the outlines of the mask and of the track's points, on average:
+    the area between them by the length of the mask's rim; NaN where it is not seen."""
+    masks, hiding = filmed.masks, filmed.hiding()
+    found = np.full(len(masks), np.nan)
+    for i in track.observed.nonzero().flatten().tolist():
+        camera, mask = filmed.cameras[i], masks[i]
+        drawn = _drawn(track, i, camera) & ~hiding[i]
+        rim = int((mask & ~ndimage.binary_erosion(mask)).sum())
+        depth = float((track.translations[i] - camera.center).norm())
+        found[i] = (drawn ^ mask).sum() / max(rim, 1) * depth / float(camera.K[0, 0])
+    return found
+
+
 def colors_of(
     track: ObjectTrack,
     normals: Float[Tensor, "P 3"],

@@ -28,6 +28,7 @@ from hoigs.preparation.objects.ball import (
 from hoigs.preparation.objects.explained import colors_of, held_back_error, silhouette_ious
 from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.plate import plate_object
+from hoigs.preparation.objects.rod import rod_object
 from hoigs.preparation.objects.shape import held_object, sphere_points
 from hoigs.preparation.objects.tracked import ObjectConfidence, tracked_object
 from hoigs.preparation.objects.watched import UntrackableError, watched
@@ -214,8 +215,9 @@ def make_object(
     be, and the confidence names why.
 
     Args:
-        way: how; "auto": as a ball where all masks are round, or else as something flat, as any
-            body by its texture, or by outlines: what explains frames that are held back better.
+        way: how; "auto": as a ball where all masks are round, or else as a rod, as something flat,
+            as any body by its texture, or by outlines: what explains frames that are held back
+            better.
         radius: of a ball, metres; None: a football's for a tracked ball, and for a round mask that
             which the limbs at it give.
         count: of points.
@@ -242,6 +244,11 @@ def make_object(
                 reasons.append(f"it cannot be posed as a ball: {reason}")
     turning, failed = _turning(filmed, way, count, progress)
     reasons += failed
+    if way in ("auto", "rod"):
+        try:
+            turning.insert(0, _Turning(*rod_object(filmed, count)))
+        except UntrackableError as reason:
+            reasons.append(f"it cannot be posed as a rod: {reason}")
     if turning and way != "auto":
         return _made(filmed, turning[0])
     track, normals, spread = held_object(filmed, count)
@@ -249,7 +256,7 @@ def make_object(
         errors = [held_back_error(one.track, one.normals, filmed) for one in turning]
         best = int(np.argmin(errors))
         if errors[0] <= errors[best] / BETTER:
-            best = 0  # the flat thing, which is said in fewer numbers
+            best = 0  # the rod, or else the flat thing, which is said in fewest numbers
         error = held_back_error(track, normals, filmed)
         if error > BETTER * errors[best]:
             return _made(filmed, turning[best])
@@ -275,8 +282,8 @@ def _turning(
     filmed: Filmed, way: ObjectWay, count: int, progress: Callable[[float], None]
 ) -> tuple[list[_Turning], list[str]]:
     """Tracks by texture, of a flat thing and of any other, and why there are no more of them."""
-    if way == "outline":
-        return [], ["object_track is outline"]
+    if way in ("outline", "rod"):
+        return [], [f"object_track is {way}"]
     found, reasons = [], []
     try:
         seen = watched(filmed)

@@ -39,7 +39,7 @@ class ObjectConfidence:
     """How far an object's track may be trusted.
 
     Attributes:
-        way: "texture and hands", "outline" or "ball": how its poses were found.
+        way: "texture and hands", "outline", "rod" or "ball": how its poses were found.
         agreement: of each frame, correlation of its texture with that of the other frames; NaN
             where it does not show enough of it. Under `AGREES` its rotation is a guess.
         outline: of each frame, metres between the mask's outline and the shape's; NaN if not seen.

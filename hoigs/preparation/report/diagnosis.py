@@ -314,6 +314,12 @@ def _object_judged(report: Measures) -> Iterator[MeasureDiagnostic]:
             "object's rotation", "unknown", report.object_reason, "fair",
             "the object does not turn in the clip; if it is no ball, --set object_track=texture",
         )  # fmt: skip
+    if report.object_way == "rod":
+        yield _judged(
+            "object's rotation", "its axis alone", report.object_reason, "fair",
+            "what is round about its axis, as a club's shaft is, needs no more; if it is no rod, "
+            "--set object_track=texture",
+        )  # fmt: skip
     if report.object_way != "texture and hands":
         return
     known = [v for v in report.object_agreement if v is not None]

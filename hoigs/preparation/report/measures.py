@@ -65,7 +65,7 @@ class Measures:
         body_residual_m: `body_residual_px` at the person's distance.
         depth_residual: typical relative error of the depth estimator once it is in metres, against
             `depth_against`; depth_residuals: of each frame. None without such an estimator.
-        object_way: how the object's poses were found: "texture and hands", "outline" or "ball";
+        object_way: how its poses were found: "texture and hands", "outline", "rod" or "ball";
             object_reason: why not better.
         object_agreement: of each frame, correlation of the object's texture with that of the other
             frames; None where it shows too little. object_outline_m: metres between the mask's
