@@ -45,8 +45,6 @@ class Render(torch.autograd.Function):
     @staticmethod
     @first_order("WarpRasterizer", "draw with rasterizer:torch, which has the second, too")
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-        from hoigs.rasterizers.warp.arguments import Gradients  # loads Warp
-
         saved = ctx.saved_tensors
         count = len(fields(Inputs))
         inputs, (records, *saved) = Inputs(*saved[:count]), saved[count:]
@@ -61,8 +59,10 @@ class Render(torch.autograd.Function):
         with torch.cuda.device_of(inputs.means):
             moving = bool(needs.K) and ctx.settings.optics
             pose = bool(needs.world_to_camera) or moving
-            out = Gradients(inputs, pose, bool(needs.absolute_gradients), ctx.settings.optics)
-            ctx.pipeline.gradients(inputs, ctx.settings, records, intersections, images, v, out)
+            out = ctx.pipeline.gradients(
+                inputs, ctx.settings, records, intersections, images, v, pose,
+                bool(needs.absolute_gradients),
+            )  # fmt: skip
         background = None
         if needs.background:
             background = v.color * (1.0 - images.alpha)[..., None]

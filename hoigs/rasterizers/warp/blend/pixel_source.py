@@ -6,6 +6,10 @@ splat's gradient over the tile take 12 shuffles: each exchange also halves how m
 keeps. There are no barriers beyond the warp and no atomics, and sums have the same order in every
 run.
 
+On CUDA the forward pass sorts a tile's intersections by depth, a chunk at a time, and only as many
+as it draws: where much is hidden, that is the twentieth part. It writes them where the backward
+pass reads them.
+
 On CUDA all tiles may share one list of Gaussians instead (see `warp.cuda.intersections`). Of each
 32, the warp then takes those whose box touches its tile, and adds its sums by atomics.
 
@@ -16,6 +20,7 @@ On a CPU the lanes run one after the other, and each adds its own share to the p
 The arguments are described in `pixel_kernels`.
 """
 
+from hoigs.rasterizers.warp.intersect.cuda_source import IN_REGISTERS
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 
 LANES = 32
@@ -25,10 +30,10 @@ WARPS = 4  # of a block
 
 _HEAD = r"""
     constexpr int P = %(PIXELS)d, STEP = 32 / %(TILE_WIDTH)d;  // rows between a lane's pixels
-    const int* offsets_ = (const int*)offsets.data;
+    int* offsets_ = (int*)offsets.data;
     const int lane = thread & 31;
 #if defined(__CUDA_ARCH__)
-    const int tile = offsets_[tiles + 3 + (thread >> 5)];
+    const int tile = offsets_[tiles + 2 + (thread >> 5)];
 #else
     const int tile = thread >> 5;
 #endif
@@ -37,13 +42,14 @@ _HEAD = r"""
     const float* records_ = (const float*)records.data;
     const float* features_ = (const float*)features.data;
     const float* background_ = (const float*)background.data;
-    const int* indices_ = (const int*)indices.data;
+    int* indices_ = (int*)indices.data;
     float* color_ = (float*)color.data;
     float* alpha_ = (float*)alpha.data;
     float* depth_ = (float*)depth.data;
     float* feature_image_ = (float*)feature_image.data;
     int begin = offsets_[tile], end = offsets_[tile + 1];
 #if defined(__CUDA_ARCH__)
+    int* sorted_until = offsets_ + 2 * tiles + 2 + tile;
     const unsigned ALL = 0xffffffffu;
     __shared__ float4 staged[%(WARPS)d * 32 * 3];
     float4* stage = staged + (threadIdx.x >> 5) * 32 * 3;
@@ -77,6 +83,96 @@ _STATE = r"""
         }
 """
 
+# Sorts the next intersections of the tile, and says how many: some hundred, all where that is less.
+# They are those with keys from `least` on and less than a bound, which a sample of the keys tells;
+# where more than CHUNK are, the bound is a quantile of those. Rows of 16 in `chunk` have a gap
+# behind them, as a lane puts so many, one after the other, which would all lie in one bank.
+_SORT_NEXT = (
+    IN_REGISTERS
+    + r"""
+    constexpr int CHUNK = 512, SAMPLE = 256, AIM = 256;
+    constexpr int FLIGHT = 4;  // loads
+    __shared__ Key chunks[%(WARPS)d * (CHUNK + CHUNK / 16)];
+    Key* chunk = chunks + (threadIdx.x >> 5) * (CHUNK + CHUNK / 16);
+    auto slot = [](int i) -> int { return i + i / 16; };
+    const Key* keys_ = (const Key*)keys.data + begin;
+    const int* owners_ = (const int*)owners.data;
+    const int number_of_all = end - begin;
+    int number_sorted = 0;
+    Key least = 0;
+    auto keep = [&](Key key, bool wanted, int kept) -> int {  // how many are kept with these
+        const unsigned all_wanted = __ballot_sync(ALL, wanted);
+        const int to = kept + __popc(all_wanted & ((1u << lane) - 1u));
+        if (wanted && to < CHUNK) chunk[slot(to)] = key;
+        return kept + __popc(all_wanted);
+    };
+    auto sort_chunk = [&](int n) {
+        __syncwarp();
+        auto get = [&](int i) { return chunk[slot(i)]; };
+        auto put = [&](int i, Key key) { chunk[slot(i)] = key; };
+        if (n > 256) sort_in_registers(K16(), n, get, put);
+        else if (n > 128) sort_in_registers(K8(), n, get, put);
+        else if (n > 64) sort_in_registers(K4(), n, get, put);
+        else if (n > 32) sort_in_registers(K2(), n, get, put);
+        else sort_in_registers(K1(), n, get, put);
+        __syncwarp();
+    };
+    auto sort_next = [&]() -> int {
+        const int left_over = number_of_all - number_sorted;
+        if (left_over == 0) return 0;
+        Key bound = ~0ull;
+        __syncwarp();  // the chunk before has been read
+        if (left_over > CHUNK) {
+            int kept = 0;
+            #pragma unroll
+            for (int j = 0; j < SAMPLE / 32; ++j) {
+                const Key key = keys_[(long long)(32 * j + lane) * number_of_all / SAMPLE];
+                kept = keep(key, key >= least, kept);
+            }
+            if (kept > 1) {
+                sort_chunk(kept);
+                const int rank = AIM * kept / left_over;
+                bound = chunk[slot(rank > 1 ? rank : 1)];
+            }
+        }
+        int found;
+        for (;;) {
+            __syncwarp();
+            found = 0;
+            for (int i = lane; i - lane < number_of_all; i += 32 * FLIGHT) {
+                Key key[FLIGHT];
+                #pragma unroll
+                for (int j = 0; j < FLIGHT; ++j)
+                    key[j] = i + 32 * j < number_of_all ? keys_[i + 32 * j] : ~0ull;
+                #pragma unroll
+                for (int j = 0; j < FLIGHT; ++j)
+                    found = keep(key[j], key[j] >= least && key[j] < bound, found);
+            }
+            sort_chunk(found < CHUNK ? found : CHUNK);
+            if (found <= CHUNK) break;
+            const int rank = (long long)AIM * CHUNK / found;
+            bound = chunk[slot(rank > 1 ? rank : 1)];
+        }
+        for (int i = lane; i < found; i += 32 * FLIGHT) {  // the Gaussian in the depth's place
+            unsigned partial[FLIGHT], owner[FLIGHT];
+            #pragma unroll
+            for (int j = 0; j < FLIGHT; ++j) {
+                if (i + 32 * j >= found) continue;
+                partial[j] = (unsigned)chunk[slot(i + 32 * j)];
+                owner[j] = owners_[partial[j]];
+            }
+            #pragma unroll
+            for (int j = 0; j < FLIGHT; ++j)
+                if (i + 32 * j < found) chunk[slot(i + 32 * j)] = (Key)owner[j] << 32 | partial[j];
+        }
+        __syncwarp();
+        least = bound;
+        number_sorted += found;
+        return found;
+    };
+"""
+)
+
 # The loop over the tile's intersections, as long as some pixel goes on. It opens blocks that DONE
 # closes; `continue` skips a splat. `exponent[i]` is log2 of alpha before the clamp, `on[i]` whether
 # pixel i is hit.
@@ -88,18 +184,21 @@ _EACH = r"""
         float4 first, second, third;
         auto fetch = [&](int from) {
             if (from + lane >= end) return;
-            index = ((const int2*)indices_)[from + lane];
+            %(INDEX)s
             const float4* record = (const float4*)records_ + 4ll * index.x;
             first = record[0];
             second = record[1];
             third = record[2];
         };
         fetch(at);
-        while (at < end) {
+        for (;;) {
             bool running = false;
             #pragma unroll
             for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
             if (!any(running)) break;
+            if (at >= end) {
+                %(MORE)s
+            }
             bool mine = at + lane < end;
             if (shared_list && mine)  // one pixel more than the box: rounding loses nothing
                 mine = first.x + third.z > (float)left - 1.0f
@@ -154,6 +253,27 @@ _EACH = r"""
                                                       : 0.0f;
 """
 
+# How the two passes read on: the first draws what it sorts, the second what is sorted.
+_SORTING = {
+    "INDEX": r"""
+            if (COLOR && !shared_list) {
+                const Key next = chunk[slot(from + lane - chunk_begin)];
+                index = make_int2((int)(next >> 32), (int)next);
+                ((int2*)indices_)[from + lane] = index;
+            } else {
+                index = ((const int2*)indices_)[from + lane];
+            }
+""",
+    "MORE": r"""
+                if (!COLOR || shared_list) break;
+                chunk_begin = at = end;
+                end += sort_next();
+                if (at == end) break;
+                fetch(at);
+""",
+}
+_SORTED = {"INDEX": "index = ((const int2*)indices_)[from + lane];", "MORE": "break;"}
+
 _FORWARD = r"""
         float sums[P][4] = {};
         %(EACH)s
@@ -172,6 +292,12 @@ _FORWARD = r"""
                 }
         DONE
         #undef DONE
+#if defined(__CUDA_ARCH__)
+        if (COLOR && !shared_list) {
+            end = end < at + 32 ? end : at + 32;  // what was fetched
+            if (lane == 0) *sorted_until = end;
+        }
+#endif
         #pragma unroll
         for (int i = 0; i < P; ++i) {
             if (!inside[i]) continue;
@@ -352,9 +478,12 @@ _SIZES = {
 }
 
 
-def _filled(body: str) -> str:
-    one = _STATE + body % {"EACH": _EACH % _SIZES}
+def _filled(body: str, start: str, reading: dict[str, str]) -> str:
+    one = _STATE + body % {"EACH": _EACH % (_SIZES | reading)}
     return f"""{_HEAD % _SIZES}
+#if defined(__CUDA_ARCH__)
+    {start}
+#endif
     {{
         constexpr bool COLOR = true;
         constexpr int channel = 0;
@@ -368,7 +497,11 @@ def _filled(body: str) -> str:
 """
 
 
-FORWARD = _filled(_FORWARD)
-_GRADIENTS = _UPSTREAM + _filled(_BACKWARD)
+_START_SORTING = r"""
+    int chunk_begin = begin;
+    if (!shared_list) end = begin;  // none is sorted yet
+"""
+FORWARD = _filled(_FORWARD, _SORT_NEXT % _SIZES + _START_SORTING, _SORTING)
+_GRADIENTS = _UPSTREAM + _filled(_BACKWARD, "if (!shared_list) end = *sorted_until;", _SORTED)
 BACKWARD = "constexpr bool ABSOLUTE = false;" + _GRADIENTS
 ABSOLUTE = "constexpr bool ABSOLUTE = true;" + _GRADIENTS

@@ -1,11 +1,13 @@
-"""Tile intersections on CUDA, found and sorted without waiting for the device.
+"""Tile intersections on CUDA, found without waiting for the device.
 
 No kernel's size depends on how many intersections there are:
 
     count    a thread a Gaussian: how many tiles its ellipse touches, and one more for each of them
     plan     one block: running sums over tiles and Gaussians, and whether the intersections fit
     place    a thread a Gaussian: its keys (depth, partial) into its tiles, in any order
-    sort     a warp or a block a tile: by depth; partials are numbered by Gaussian, so ties by index
+
+`blend` sorts them by depth, as far as it draws. Partials are numbered by Gaussian, so that ties are
+broken by index.
 
 `Scratch.counts` is zero before and after, since `place` counts down where `count` counted up.
 
@@ -28,7 +30,7 @@ from hoigs.rasterizers.warp.arguments import Projected
 from hoigs.rasterizers.warp.blend.pixel_source import TILE_HEIGHT
 from hoigs.rasterizers.warp.frame import INT32, Settings, TileIntersections, check_addressable
 from hoigs.rasterizers.warp.intersect import cuda_kernels
-from hoigs.rasterizers.warp.intersect.cuda_source import BLOCK, PLAN_BLOCK, SORT_BLOCK
+from hoigs.rasterizers.warp.intersect.cuda_source import BLOCK, PLAN_BLOCK
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 
 # For how many tile intersections to allocate memory, without waiting for the device.
@@ -89,33 +91,22 @@ class IntersectionCapacity:
         return self._capacity
 
 
-SORTED_BY_BLOCK = 4  # tiles; about as many blocks as there are long lists
-
-
 class Scratch:
     """What is needed only while intersections are made; one for each stream, reused.
 
     Attributes:
         counts: [tiles] int32, zero between uses. sums: one for each block of Gaussians.
-        keys: [capacity] int64. owners: [capacity] int32.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.counts = torch.zeros(0, dtype=torch.int32, device=device)
         self.sums = torch.empty(0, dtype=torch.int32, device=device)
-        self.keys = torch.empty(0, dtype=torch.int64, device=device)
-        self.owners = torch.empty(0, dtype=torch.int32, device=device)
 
     def for_splats(self, count: int, tiles: int) -> None:
         if self.counts.numel() < tiles:
             self.counts = self.counts.new_zeros(tiles)
         if self.sums.numel() * BLOCK < count:
             self.sums = self.sums.new_empty(-(-count // BLOCK))
-
-    def for_intersections(self, capacity: int) -> None:
-        if self.keys.numel() < capacity:
-            self.keys = self.keys.new_empty(capacity)
-            self.owners = self.owners.new_empty(capacity)
 
 
 class Intersector:
@@ -132,7 +123,7 @@ class Intersector:
 
     def __init__(self, streams: CudaStreams, capacity: IntersectionCapacity) -> None:
         self.streams, self.capacity = streams, capacity
-        self._scratch: dict[int, Scratch] = {}
+        self._scratch: dict[CudaStream, Scratch] = {}
         self._lock = threading.Lock()  # the kernels of two renders must not mix in one scratch
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
@@ -141,34 +132,32 @@ class Intersector:
         depths, records = projected.drawn_depths, projected.records
         new = depths.new_empty
         first_partial, tiles_per_gaussian = new((2, count), dtype=torch.int32).unbind()
-        offsets = new(2 * tiles + 3, dtype=torch.int32)
+        offsets = new(3 * tiles + 2, dtype=torch.int32)
+        stream = self.streams.current(depths.device.index)
         with self._lock:
-            scratch = self._scratch_of_stream(depths.device)
+            scratch = self._scratch_of(stream, depths.device)
             scratch.for_splats(count, tiles)
             splats = [records, depths, count, TILE_HEIGHT, tiles_x, tiles_y, settings.width]
             splats += [scratch.counts, first_partial, tiles_per_gaussian, scratch.sums]
             blocks = -(-count // BLOCK)
-            stream = self.streams.current()
             stream.blocks(cuda_kernels.count_intersections, blocks, BLOCK, splats)
             capacity = self.capacity.of(count, tiles)
             plan = [depths, count, tiles, capacity, 0, scratch.counts, scratch.sums, offsets]
             known = capacity > 0
             if not known:
                 capacity = self._count(stream, plan, offsets, count, tiles)
-            scratch.for_intersections(capacity)
             indices = new((capacity, 2), dtype=torch.int32)
+            keys, owners = new(capacity, dtype=torch.int64), new(capacity, dtype=torch.int32)
             if known:
                 largest = self.capacity.largest, self.capacity.largest_on_host
-                arguments = [*plan, scratch.keys, indices, *largest]
+                arguments = [*plan, keys, indices, *largest]
                 stream.blocks(cuda_kernels.plan_intersections, 1, PLAN_BLOCK, arguments)
-            arguments = [*splats, offsets, scratch.keys, scratch.owners]
+            arguments = [*splats, offsets, keys, owners]
             stream.blocks(cuda_kernels.place_intersections, blocks, BLOCK, arguments)
-            sorters = -(-tiles // SORTED_BY_BLOCK)
-            arguments = [sorters, tiles, offsets, scratch.keys, scratch.owners, indices]
-            stream.blocks(cuda_kernels.sort_intersections, sorters, SORT_BLOCK, arguments)
         return TileIntersections(
-            TILE_HEIGHT, tiles_x, tiles_y, offsets, indices, first_partial, tiles_per_gaussian
-        )
+            TILE_HEIGHT, tiles_x, tiles_y, offsets, indices, first_partial, tiles_per_gaussian,
+            keys, owners,
+        )  # fmt: skip
 
     def _count(
         self, stream: CudaStream, plan: list, offsets: Tensor, count: int, tiles: int
@@ -193,12 +182,11 @@ class Intersector:
             )
         return self.capacity.counted(count, tiles, found)
 
-    def _scratch_of_stream(self, device: torch.device) -> Scratch:
+    def _scratch_of(self, stream: CudaStream, device: torch.device) -> Scratch:
         """Kept for each stream; a graph that is captured gets one of its own."""
         if torch.cuda.is_current_stream_capturing():
             self.capacity.keep_for_graphs()
             return Scratch(device)
-        stream = torch.cuda.current_stream().cuda_stream
         if stream not in self._scratch:
             self._scratch[stream] = Scratch(device)
         return self._scratch[stream]

@@ -1,28 +1,25 @@
 # mypy: ignore-errors
 # (Warp's arrays annotate as values)
-"""CUDA kernels that find and sort tile intersections; `warp.cuda.intersections` launches them.
+"""CUDA kernels that find tile intersections; `warp.cuda.intersections` launches them.
 
-Their C++ stands in `count_place_source` and `plan_sort_source`.
+Their C++ stands in `cuda_source`.
 """
 
 from hoigs.core.system.quiet_warp import wp
-from hoigs.rasterizers.warp.intersect import cuda_source as count_place_source
-from hoigs.rasterizers.warp.intersect import cuda_source as plan_sort_source
+from hoigs.rasterizers.warp.intersect import cuda_source
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 from hoigs.rasterizers.warp.records import F32, I32, I64
 
 wp.set_module_options({"enable_backward": False})
 
-SORT_BLOCK = wp.constant(plan_sort_source.SORT_BLOCK)
 _SIZES = {
     "WIDTH": TILE_WIDTH,
-    "BLOCK": count_place_source.BLOCK,
-    "PLAN_BLOCK": plan_sort_source.PLAN_BLOCK,
-    "SORT_BLOCK": plan_sort_source.SORT_BLOCK,
+    "BLOCK": cuda_source.BLOCK,
+    "PLAN_BLOCK": cuda_source.PLAN_BLOCK,
 }
 
 
-@wp.func_native(count_place_source.COUNT % _SIZES)
+@wp.func_native(cuda_source.COUNT % _SIZES)
 def count_native(
     row: int, records: F32, drawn_depths: F32, count: int, tile_height: int, tiles_x: int,
     tiles_y: int, width: int, counts: I32, first_partial: I32, tiles_per_gaussian: I32,
@@ -30,7 +27,7 @@ def count_native(
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=count_place_source.BLOCK)
+@wp.kernel(launch_bounds=cuda_source.BLOCK)
 def count_intersections(
     records: F32,
     drawn_depths: F32,  # [N], negative where nothing is drawn
@@ -50,14 +47,14 @@ def count_intersections(
     )  # fmt: skip
 
 
-@wp.func_native(plan_sort_source.PLAN % _SIZES)
+@wp.func_native(cuda_source.PLAN % _SIZES)
 def plan_native(
     drawn_depths: F32, count: int, tiles: int, capacity: int, measuring: int, counts: I32,
     sums: I32, offsets: I32, keys: I64, indices: I32, largest: I64, largest_on_host: I64,
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=plan_sort_source.PLAN_BLOCK)
+@wp.kernel(launch_bounds=cuda_source.PLAN_BLOCK)
 def plan_intersections(
     drawn_depths: F32,
     count: int,
@@ -66,8 +63,9 @@ def plan_intersections(
     measuring: int,  # 1: count only; 0: where they do not fit, make one shared list
     counts: I32,
     sums: I32,  # becomes the number of intersections before each block
-    # [2 tiles + 3]: the first intersection of each tile; the number of intersections; the length of
-    # the shared list, or -1; the number of tiles with long lists; the tiles, longest lists first
+    # [3 tiles + 2]: the first intersection of each tile; the number of intersections; the length of
+    # the shared list, or -1; the tiles, longest lists first; from `forward_pixels`, up to which
+    # intersection each tile's are sorted
     offsets: I32,
     keys: I64,
     indices: I32,
@@ -80,7 +78,7 @@ def plan_intersections(
     )  # fmt: skip
 
 
-@wp.func_native(count_place_source.PLACE % _SIZES)
+@wp.func_native(cuda_source.PLACE % _SIZES)
 def place_native(
     row: int, records: F32, drawn_depths: F32, count: int, tile_height: int, tiles_x: int,
     tiles_y: int, width: int, counts: I32, first_partial: I32, tiles_per_gaussian: I32,
@@ -88,7 +86,7 @@ def place_native(
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=count_place_source.BLOCK)
+@wp.kernel(launch_bounds=cuda_source.BLOCK)
 def place_intersections(
     records: F32, drawn_depths: F32, count: int, tile_height: int, tiles_x: int, tiles_y: int,
     width: int,
@@ -102,18 +100,3 @@ def place_intersections(
         wp.tid(), records, drawn_depths, count, tile_height, tiles_x, tiles_y, width, counts,
         first_partial, tiles_per_gaussian, sums, offsets, keys, owners,
     )  # fmt: skip
-
-
-@wp.func_native(plan_sort_source.SORT % _SIZES)
-def sort_native(
-    block: int, blocks: int, tiles: int, offsets: I32, keys: I64, owners: I32, indices: I32,
-): ...  # fmt: skip
-
-
-@wp.kernel(launch_bounds=(plan_sort_source.SORT_BLOCK, 3))
-def sort_intersections(
-    blocks: int,  # of the launch
-    tiles: int, offsets: I32, keys: I64, owners: I32,
-    indices: I32,  # [capacity, 2]: Gaussian, partial
-):  # fmt: skip
-    sort_native(wp.tid() // SORT_BLOCK, blocks, tiles, offsets, keys, owners, indices)

@@ -1,4 +1,4 @@
-"""CUDA C++ of the kernels that count, place, plan and sort tile intersections."""
+"""CUDA C++ of the kernels that count, place and plan tile intersections, and of sorting them."""
 
 from __future__ import annotations
 
@@ -182,31 +182,26 @@ PLACE = (
 )
 
 
-# CUDA C++ of the kernels that plan the lists of tile intersections and sort them.
+# CUDA C++ of the kernel that plans the lists of tile intersections, and of what sorts them.
 #
 # The arguments are described in `cuda_kernels`.
 
 PLAN_BLOCK = 1024  # threads
-SORT_BLOCK = 256
 
-# Sorting keys, all different. A warp sorts up to 256 in registers, N neighbours in each lane: a
-# bitonic network over them and, by shuffles, over the lanes. A block sorts a window in shared
-# memory, a piece for each of eight warps, and merges the pieces; longer lists are windows merged,
-# where the two arrays take turns. Every thread of the block calls `sorted`, which returns the array
-# that holds the result. THREADS, of the block, stands before.
-_SORTED = r"""
+# Sorting keys, all different, by one warp: up to 32 N in registers, N neighbours in each lane, by a
+# bitonic network over them and, by shuffles, over the lanes. `get` and `put` are given places.
+IN_REGISTERS = r"""
     typedef unsigned long long Key;
-    constexpr int LONGEST = 256, PIECES = 8, WINDOW = PIECES * LONGEST, EACH = WINDOW / THREADS;
-    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
     struct K1 { enum { N = 1 }; };
     struct K2 { enum { N = 2 }; };
     struct K4 { enum { N = 4 }; };
     struct K8 { enum { N = 8 }; };
-    auto sort_in_registers = [&](auto kind, const Key* from, int n, auto put) {
+    struct K16 { enum { N = 16 }; };
+    auto sort_in_registers = [&](auto kind, int n, auto get, auto put) {
         constexpr int N = decltype(kind)::N;
         Key key[N];
         #pragma unroll
-        for (int j = 0; j < N; ++j) key[j] = 32 * j + lane < n ? from[32 * j + lane] : ~0ull;
+        for (int j = 0; j < N; ++j) key[j] = 32 * j + lane < n ? get(32 * j + lane) : ~0ull;
         #pragma unroll
         for (int run = 2; run <= 32 * N; run *= 2) {
             #pragma unroll
@@ -233,10 +228,23 @@ _SORTED = r"""
                 }
             }
         }
+        __syncwarp();  // all have been got
         #pragma unroll
         for (int j = 0; j < N; ++j)
             if (lane * N + j < n) put(lane * N + j, key[j]);
     };
+"""
+
+# By a block: windows in shared memory, a piece for each of eight warps, and the pieces merged;
+# longer lists are windows merged, where the two arrays take turns. Every thread of the block calls
+# `sorted`, which returns the array that holds the result. THREADS, of the block, stands before.
+_SORTED = (
+    r"""
+    const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+"""
+    + IN_REGISTERS
+    + r"""
+    constexpr int LONGEST = 256, PIECES = 8, WINDOW = PIECES * LONGEST, EACH = WINDOW / THREADS;
     // `number` keys of the merged runs [left, middle) and [middle, right), from the rank-th on
     auto merge = [](const Key* from, auto left, auto middle, auto right, auto rank, auto number,
                     auto put) {
@@ -258,12 +266,12 @@ _SORTED = r"""
             const int piece = here > 4 * LONGEST ? LONGEST : here > 2 * LONGEST ? LONGEST / 2
                                                            : LONGEST / 4;
             const int mine = here - warp * piece;  // keys from this warp's piece on
-            const Key* from = keys + begin + warp * piece;
+            auto get = [&](int k) { return keys[begin + warp * piece + k]; };
             auto put = [&](int k, Key key) { window[warp * piece + k] = key; };
             if (warp < PIECES && mine > 0) {
-                if (piece == LONGEST) sort_in_registers(K8(), from, mine, put);
-                else if (piece == LONGEST / 2) sort_in_registers(K4(), from, mine, put);
-                else sort_in_registers(K2(), from, mine, put);
+                if (piece == LONGEST) sort_in_registers(K8(), mine, get, put);
+                else if (piece == LONGEST / 2) sort_in_registers(K4(), mine, get, put);
+                else sort_in_registers(K2(), mine, get, put);
             }
             __syncthreads();
             for (int run = piece; run < here; run *= 2) {
@@ -304,6 +312,7 @@ _SORTED = r"""
         return keys;
     };
 """
+)
 PLAN = (
     "constexpr int THREADS = %(PLAN_BLOCK)d;"
     + _SORTED
@@ -364,7 +373,7 @@ PLAN = (
     // tiles are drawn in this order: longest lists first
     constexpr int CLASSES = 64;
     __shared__ int places[CLASSES];
-    int* order_ = offsets_ + tiles + 3;
+    int* order_ = offsets_ + tiles + 2;
     auto class_of = [&](int tile) -> int {
         const int length = (counts_[tile] + 31) / 32;
         return CLASSES - 1 - (length < CLASSES - 1 ? length : CLASSES - 1);
@@ -379,7 +388,6 @@ PLAN = (
             const int here = places[c];
             places[c] = before;
             before += here;
-            if (c == CLASSES - 2 - LONGEST / 32) offsets_[tiles + 2] = before;  // longer than that
         }
     }
     __syncthreads();
@@ -405,43 +413,5 @@ PLAN = (
     }
     __syncthreads();
     if (threadIdx.x == 0) offsets_[tiles + 1] = length;
-"""
-)
-
-# Blocks sort the long lists, which come first, one at a time; then each warp sorts short ones.
-SORT = (
-    "constexpr int THREADS = %(SORT_BLOCK)d;"
-    + _SORTED
-    + r"""
-    const int* offsets_ = (const int*)offsets.data;
-    const int* order_ = offsets_ + tiles + 3;
-    const int* owners_ = (const int*)owners.data;
-    if (offsets_[tiles + 1] >= 0) return;
-    const int number_of_long = offsets_[tiles + 2];
-    for (int k = block; k < number_of_long; k += blocks) {
-        const int begin = offsets_[order_[k]], n = offsets_[order_[k] + 1] - begin;
-        Key* list = (Key*)indices.data + begin;
-        const Key* sorted_keys = sorted((Key*)keys.data + begin, list, n);
-        for (int i = threadIdx.x; i < n; i += THREADS) {
-            const unsigned partial = (unsigned)sorted_keys[i];
-            ((int2*)list)[i] = make_int2(owners_[partial], (int)partial);
-        }
-        __syncthreads();
-    }
-    const int others = blocks - 1 - block;  // the first blocks have long lists
-    for (int k = number_of_long + others * (THREADS / 32) + warp; k < tiles;
-         k += blocks * (THREADS / 32)) {
-        const int begin = offsets_[order_[k]], n = offsets_[order_[k] + 1] - begin;
-        const Key* from = (const Key*)keys.data + begin;
-        int2* to = (int2*)indices.data + begin;
-        auto put = [&](int i, Key key) {
-            const unsigned partial = (unsigned)key;
-            to[i] = make_int2(owners_[partial], (int)partial);
-        };
-        if (n > 128) sort_in_registers(K8(), from, n, put);
-        else if (n > 64) sort_in_registers(K4(), from, n, put);
-        else if (n > 32) sort_in_registers(K2(), from, n, put);
-        else if (n > 0) sort_in_registers(K1(), from, n, put);
-    }
 """
 )
