@@ -16,6 +16,7 @@ from hoigs.core.maths.optics import Optics
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
+from hoigs.rasterizers.warp.cuda import intersections
 from hoigs.rasterizers.warp.frame import Images, Inputs, TileIntersections
 from hoigs.testing.rasterizer.subject import on, require_close_gradient
 
@@ -146,7 +147,7 @@ def test_long_lists_are_in_order(depths: str) -> None:
     offsets, shared = tiles.offsets[: tiles.tiles + 1].tolist(), tiles.offsets[tiles.tiles + 1]
     assert shared == -1
     assert max(b - a for a, b in pairwise(offsets)) > 5000
-    assert tiles.offsets[-tiles.tiles :].tolist() == offsets[1:]
+    assert tiles.offsets[2 * tiles.tiles + 2 :][: tiles.tiles].tolist() == offsets[1:]
     partials = []
     for begin, end in pairwise(offsets):
         rows, here = tiles.indices[begin:end].long().unbind(1)
@@ -182,6 +183,56 @@ def blended(
     projected = pipeline.project(inputs, settings)
     tiles = pipeline.intersect(projected, settings)
     return tiles, projected.drawn_depths, pipeline.blend(inputs, settings, projected.records, tiles)
+
+
+@pytest.mark.parametrize("opacity", [-4.0, 0.0, 4.0])
+@pytest.mark.parametrize("channels", [0, 6])
+def test_the_nearest_before_the_others_draw_the_same(
+    opacity: float, channels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the nearest leave all tiles open, some, and few."""
+    gaussians, camera = scene(6000)
+    gaussians = gaussians.replace(opacity_logits=gaussians.opacity_logits + opacity)
+    features = torch.randn(6000, channels, device=CUDA) if channels else None
+    request = RenderRequest(features=features, absolute_gradients=torch.zeros(6000, 2, device=CUDA))
+    wanted = drawn(WarpRasterizer(), gaussians, camera, request)
+    in_two_parts(monkeypatch)
+    rasterizer = WarpRasterizer()
+    capacity = rasterizer.pipeline(CUDA).capacity
+    for time in ("first", "second", "without memory", "with some", "with all"):
+        if time == "without memory":
+            needed = int(capacity.largest[0])
+            capacity._capacity = 6000
+            capacity._largest[0] = capacity.largest[0] = 0
+        actual = drawn(rasterizer, gaussians, camera, request)
+        torch.cuda.synchronize()
+        for name, image in wanted[0].items():
+            assert torch.equal(actual[0][name], image), (time, name)
+        for name, gradient in wanted[1].items():
+            assert_close_gradient(name, actual[1][name], gradient)
+        if time == "first":
+            first = actual
+        elif time in ("second", "with all"):
+            assert all(torch.equal(actual[1][name], first[1][name]) for name in first[1]), time
+    assert int(capacity.largest[0]) == needed > 6000, "the intersections fit: this tests nothing"
+
+
+def in_two_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(intersections, "MANY", 0)
+    monkeypatch.setattr(intersections, "DENSE", 0)
+
+
+def test_the_nearest_before_the_others_can_be_captured(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_two_parts(monkeypatch)
+    gaussians, camera = scene(20_000, 300, 200)
+    opaque = gaussians.replace(opacity_logits=gaussians.opacity_logits + 4.0)
+    rasterizer = WarpRasterizer()
+    draw = rasterizer.capture(opaque, camera)
+    assert torch.equal(draw().color, rasterizer.render(opaque, camera).color)
+    wanted = rasterizer.render(gaussians, camera).color
+    for _ in range(2):  # more intersections than there was memory, then captured again
+        assert torch.equal(draw(gaussians=gaussians).color, wanted)
+        torch.cuda.synchronize()
 
 
 @pytest.mark.parametrize("absolute", [False, True])

@@ -88,6 +88,7 @@ class TileIntersections:
         first_partial: [N] int32, the first partial of each Gaussian.
         tiles_per_gaussian: [N] int32, how many tiles, and so partials, each Gaussian has.
         keys, owners: what `blend` sorts on CUDA, see `intersect.cuda_kernels`; for it alone.
+        counted: what `cuda.intersections` needs to add the other Gaussians to the nearest.
     """
 
     tile_height: int
@@ -99,6 +100,7 @@ class TileIntersections:
     tiles_per_gaussian: Tensor
     keys: Tensor | None = None
     owners: Tensor | None = None
+    counted: list[Any] | None = None
 
     @property
     def tiles(self) -> int:

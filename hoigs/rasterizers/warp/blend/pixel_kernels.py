@@ -20,11 +20,11 @@ def forward_native(
     thread: int, tiles: int, tiles_x: int, width: int, height: int, max_alpha: float,
     log2_min_alpha: float, min_transmittance: float, records: F32, indices: I32, offsets: I32,
     features: F32, channels: int, background: F32, background_stride: int, color: F32,
-    alpha: F32, depth: F32, feature_image: F32, keys: I64, owners: I32,
+    alpha: F32, depth: F32, feature_image: F32, keys: I64, owners: I32, part: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=BLOCK)
+@wp.kernel(launch_bounds=(BLOCK, 5))
 def forward_pixels(
     tiles: int, tiles_x: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
     min_transmittance: float,  # negative: never stop
@@ -38,6 +38,7 @@ def forward_pixels(
     feature_image: F32,  # [H, W, channels]
     keys: I64,  # on CUDA, as `intersect.cuda_kernels` have them; indices are sorted on a CPU
     owners: I32,  # likewise
+    part: int,  # of the Gaussians, as there
     base: int, count: int,
 ):  # fmt: skip
     thread = wp.tid() + base
@@ -45,7 +46,7 @@ def forward_pixels(
         forward_native(
             thread, tiles, tiles_x, width, height, max_alpha, log2_min_alpha, min_transmittance,
             records, indices, offsets, features, channels, background, background_stride, color,
-            alpha, depth, feature_image, keys, owners,
+            alpha, depth, feature_image, keys, owners, part,
         )  # fmt: skip
 
 

@@ -47,7 +47,7 @@ class CpuPipeline(ABC):
     backward_kernel: ClassVar[Any]
     absolute_kernel: ClassVar[Any]  # backward, with absolute gradients
     # what the kernels take besides, forward and backward
-    further: ClassVar[tuple[tuple[Tensor, ...], tuple[Tensor, ...]]] = ((), ())
+    further: ClassVar[tuple[tuple[Any, ...], tuple[Any, ...]]] = ((), ())
 
     def __init__(self, cores: Cores) -> None:
         self.cores = cores
@@ -183,7 +183,7 @@ class PortablePipeline(CpuPipeline):
     forward_kernel, backward_kernel = pixel_kernels.forward_pixels, pixel_kernels.backward_pixels
     absolute_kernel = scalar_absolute_kernels.absolute_pixels
     further = (
-        (torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int32)),
+        (torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int32), 0),
         (torch.empty(0, dtype=torch.uint8),),
     )
 

@@ -9,6 +9,9 @@ No kernel's size depends on how many intersections there are:
 `blend` sorts them by depth, as far as it draws. Partials are numbered by Gaussian, so that ties are
 broken by index.
 
+Where Gaussians are many, most of them are hidden, and so are most intersections. There all this is
+done for the nearest sixth, and once that is drawn, for the others in tiles that it leaves open.
+
 `Scratch.counts` is zero before and after, since `place` counts down where `count` counted up.
 
 Where the intersections exceed the allocated memory, `plan` sorts all drawn Gaussians into one list
@@ -30,7 +33,7 @@ from hoigs.rasterizers.warp.arguments import Projected
 from hoigs.rasterizers.warp.blend.pixel_source import TILE_HEIGHT
 from hoigs.rasterizers.warp.frame import INT32, Settings, TileIntersections, check_addressable
 from hoigs.rasterizers.warp.intersect import cuda_kernels
-from hoigs.rasterizers.warp.intersect.cuda_source import BLOCK, PLAN_BLOCK
+from hoigs.rasterizers.warp.intersect.cuda_source import BLOCK, PLAN_BLOCK, STATE_SIZE
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 
 # For how many tile intersections to allocate memory, without waiting for the device.
@@ -91,6 +94,12 @@ class IntersectionCapacity:
         return self._capacity
 
 
+# From how many Gaussians on, in all and for each tile, the nearest are drawn before the others.
+# With fewer, the launches take longer than what they save. It depends on nothing else, so that two
+# renders of the same input sum alike.
+MANY, DENSE = 2**18, 48
+
+
 class Scratch:
     """What is needed only while intersections are made; one for each stream, reused.
 
@@ -127,52 +136,76 @@ class Intersector:
         self._lock = threading.Lock()  # the kernels of two renders must not mix in one scratch
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
+        """Of all Gaussians, or of the nearest of many: where `counted` is given, others follow."""
         tiles_x, tiles_y = -(-settings.width // TILE_WIDTH), -(-settings.height // TILE_HEIGHT)
         count, tiles = projected.depths.shape[0], tiles_x * tiles_y
-        depths, records = projected.drawn_depths, projected.records
+        depths = projected.drawn_depths
         new = depths.new_empty
-        first_partial, tiles_per_gaussian = new((2, count), dtype=torch.int32).unbind()
-        offsets = new(3 * tiles + 2, dtype=torch.int32)
+        of_gaussian = new((2, count), dtype=torch.int32).unbind()
+        offsets = new(6 * tiles + STATE_SIZE, dtype=torch.int32)
+        splats = [projected.records, depths, count, TILE_HEIGHT, tiles_x, tiles_y, settings.width]
+        many = count >= max(MANY, DENSE * tiles)
+        part = cuda_kernels.NEAR if many else cuda_kernels.ALL
         stream = self.streams.current(depths.device.index)
         with self._lock:
             scratch = self._scratch_of(stream, depths.device)
             scratch.for_splats(count, tiles)
-            splats = [records, depths, count, TILE_HEIGHT, tiles_x, tiles_y, settings.width]
-            splats += [scratch.counts, first_partial, tiles_per_gaussian, scratch.sums]
-            blocks = -(-count // BLOCK)
-            stream.blocks(cuda_kernels.count_intersections, blocks, BLOCK, splats)
+            counted = [*splats, scratch.counts, *of_gaussian, scratch.sums, offsets]
             capacity = self.capacity.of(count, tiles)
-            plan = [depths, count, tiles, capacity, 0, scratch.counts, scratch.sums, offsets]
             known = capacity > 0
             if not known:
-                capacity = self._count(stream, plan, offsets, count, tiles)
+                capacity = self._measure(stream, counted, tiles, many)
+            if known or many:
+                _count(stream, part, counted)
             indices = new((capacity, 2), dtype=torch.int32)
             keys, owners = new(capacity, dtype=torch.int64), new(capacity, dtype=torch.int32)
-            if known:
-                largest = self.capacity.largest, self.capacity.largest_on_host
-                arguments = [*plan, keys, indices, *largest]
-                stream.blocks(cuda_kernels.plan_intersections, 1, PLAN_BLOCK, arguments)
-            arguments = [*splats, offsets, keys, owners]
-            stream.blocks(cuda_kernels.place_intersections, blocks, BLOCK, arguments)
+            if known or many:
+                self._plan(stream, part, counted, tiles, capacity, keys, indices)
+            _place(stream, part, counted, keys, owners)
         return TileIntersections(
-            TILE_HEIGHT, tiles_x, tiles_y, offsets, indices, first_partial, tiles_per_gaussian,
-            keys, owners,
+            TILE_HEIGHT, tiles_x, tiles_y, offsets, indices, *of_gaussian, keys, owners,
+            counted if many else None,
         )  # fmt: skip
 
-    def _count(
-        self, stream: CudaStream, plan: list, offsets: Tensor, count: int, tiles: int
-    ) -> int:
-        """Capacity for this render, by waiting for its number of intersections."""
+    def intersect_others(self, near: TileIntersections) -> None:
+        """Add the other Gaussians where the nearest, once drawn, leave a tile open."""
+        part, depths = cuda_kernels.OTHERS, near.counted[1]
+        stream = self.streams.current(depths.device.index)
+        with self._lock:
+            _count(stream, part, near.counted)
+            self._plan(stream, part, near.counted, near.tiles, near.count, near.keys, near.indices)
+            _place(stream, part, near.counted, near.keys, near.owners)
+        if self.capacity.of(len(depths), near.tiles) == 0:  # `_measure` was for this render alone
+            self.capacity.counted(len(depths), near.tiles, int(self.capacity.largest[0]))
+
+    def _plan(
+        self, stream: CudaStream, part: int, counted: list, tiles: int, capacity: int,
+        keys: Tensor, indices: Tensor,
+    ) -> None:  # fmt: skip
+        _, depths, count, *_, counts, _, _, sums, offsets = counted
+        arguments = [part, depths, count, tiles, capacity, 0, counts, sums, offsets, keys, indices]
+        arguments += [self.capacity.largest, self.capacity.largest_on_host]
+        stream.blocks(cuda_kernels.plan_intersections, 1, PLAN_BLOCK, arguments)
+
+    def _measure(self, stream: CudaStream, counted: list, tiles: int, many: bool) -> int:
+        """Capacity for this render, by waiting for its number of intersections.
+
+        Of many Gaussians it is that of all of them; later renders need less.
+        """
+        _, depths, count, *_, counts, _, _, sums, offsets = counted
         if torch.cuda.is_current_stream_capturing():
             raise RenderError(
                 f"WarpRasterizer: {count} Gaussians and {tiles} tiles are more than it has drawn "
                 "so far, and their intersections cannot be counted while a CUDA graph is captured: "
                 "render once before the capture"
             )
-        plan[4] = 1  # count only
+        _count(stream, cuda_kernels.ALL, counted)
         none = offsets.new_empty(0)
-        largest = self.capacity.largest, self.capacity.largest_on_host
-        arguments = [*plan, none.long(), none, *largest]
+        largest = [self.capacity.largest, self.capacity.largest_on_host]
+        if many:
+            largest = [torch.zeros_like(self.capacity.largest) for _ in range(2)]
+        arguments = [cuda_kernels.ALL, depths, count, tiles, 0, 1, counts, sums, offsets]
+        arguments += [none.long(), none, *largest]
         stream.blocks(cuda_kernels.plan_intersections, 1, PLAN_BLOCK, arguments)
         found = int(offsets[tiles])
         if found == INT32:
@@ -180,6 +213,9 @@ class Intersector:
             check_addressable(
                 INT32 + 1, f"the intersections of {count} Gaussians with {tiles} tiles"
             )
+        if many:
+            counts.zero_()
+            return max(found, count)
         return self.capacity.counted(count, tiles, found)
 
     def _scratch_of(self, stream: CudaStream, device: torch.device) -> Scratch:
@@ -190,3 +226,14 @@ class Intersector:
         if stream not in self._scratch:
             self._scratch[stream] = Scratch(device)
         return self._scratch[stream]
+
+
+def _count(stream: CudaStream, part: int, counted: list) -> None:
+    blocks = -(-counted[2] // BLOCK)
+    stream.blocks(cuda_kernels.count_intersections, blocks, BLOCK, [part, *counted])
+
+
+def _place(stream: CudaStream, part: int, counted: list, keys: Tensor, owners: Tensor) -> None:
+    blocks = -(-counted[2] // BLOCK)
+    arguments = [part, *counted, keys, owners]
+    stream.blocks(cuda_kernels.place_intersections, blocks, BLOCK, arguments)

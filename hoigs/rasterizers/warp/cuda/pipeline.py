@@ -28,6 +28,7 @@ from hoigs.rasterizers.warp.frame import (
     TileIntersections,
     check_addressable,
 )
+from hoigs.rasterizers.warp.intersect import cuda_kernels
 from hoigs.rasterizers.warp.project import kernels as pinhole
 from hoigs.rasterizers.warp.project import optics
 from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import BLOCK as SH_BLOCK
@@ -66,7 +67,12 @@ class CudaPipeline:
         arguments = tile_arguments(inputs, settings, records, intersections, images)
         arguments += [intersections.keys, intersections.owners]
         lanes, stream = intersections.tiles * pixel_source.LANES, self.streams.current(self.device)
-        stream.each(pixel_kernels.forward_pixels, lanes, arguments, TILE_BLOCK)
+        kernel, part = pixel_kernels.forward_pixels, cuda_kernels.ALL
+        if intersections.counted is not None:
+            stream.each(kernel, lanes, [*arguments, cuda_kernels.NEAR], TILE_BLOCK)
+            self._intersector.intersect_others(intersections)
+            part = cuda_kernels.OTHERS
+        stream.each(kernel, lanes, [*arguments, part], TILE_BLOCK)
         return images
 
     def gradients(
