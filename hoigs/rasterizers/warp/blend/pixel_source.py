@@ -92,7 +92,7 @@ _CHUNK = (
     r"""
     struct Chunk {
         typedef unsigned long long Key;
-        enum { SIZE = 512, SAMPLE = 256, AIM = 256, FLIGHT = 4, LENGTH = SIZE + SIZE / 16 + 1 };
+        enum { SIZE = 512, SAMPLE = 256, AIM = 192, FLIGHT = 4, LENGTH = SIZE + SIZE / 16 + 1 };
         static __device__ int slot(int i) { return i + i / 16; }
         // how many are kept with these
         static __device__ int keep(Key* chunk, Key key, bool wanted, int kept) {
