@@ -25,10 +25,10 @@ class Projected:
 
     def __init__(self, like: Tensor, count: int) -> None:
         self.records = like.new_empty(count, RECORD)
-        self.means2d = like.new_empty(count, 2)
-        self.depths = like.new_empty(count)
-        self.drawn_depths = like.new_empty(count)
-        self.radii = like.new_empty(count)
+        # one allocation, since the first kernel waits for it
+        numbers = like.new_empty(5 * count).split([2 * count, count, count, count])
+        means2d, self.depths, self.drawn_depths, self.radii = numbers
+        self.means2d = means2d.view(count, 2)
 
 
 def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> list[Any]:

@@ -60,7 +60,7 @@ def backward_native(
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=(BLOCK, 7))
+@wp.kernel(launch_bounds=(BLOCK, 5))
 def backward_pixels(
     tiles: int, tiles_x: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
     min_transmittance: float, records: F32, indices: I32, offsets: I32, features: F32,

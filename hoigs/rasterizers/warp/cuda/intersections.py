@@ -141,8 +141,8 @@ class Intersector:
         count, tiles = projected.depths.shape[0], tiles_x * tiles_y
         depths = projected.drawn_depths
         new = depths.new_empty
-        of_gaussian = new((2, count), dtype=torch.int32).unbind()
-        offsets = new(6 * tiles + STATE_SIZE, dtype=torch.int32)
+        sizes = [count, count, 6 * tiles + STATE_SIZE]
+        *of_gaussian, offsets = new(sum(sizes), dtype=torch.int32).split(sizes)
         splats = [projected.records, depths, count, TILE_HEIGHT, tiles_x, tiles_y, settings.width]
         many = count >= max(MANY, DENSE * tiles)
         part = cuda_kernels.NEAR if many else cuda_kernels.ALL
