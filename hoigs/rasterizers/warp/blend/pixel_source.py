@@ -224,7 +224,7 @@ _EACH = r"""
                 __syncwarp();
                 fetch(at + 32);  // on their way while these are drawn
                 for (int k = 0; k < 32 - __clz(taken); ++k) {
-                if (shared_list && !(taken >> k & 1)) continue;
+                    if (shared_list && !(taken >> k & 1)) continue;
                 const float4 g0 = stage[3 * k], g1 = stage[3 * k + 1], g2 = stage[3 * k + 2];
                 const int row = __float_as_int(g2.z), partial = __float_as_int(g2.w);
 #else
