@@ -85,6 +85,7 @@ def work() -> int:
     from hoigs.core.maths.optics import Optics
     from hoigs.metrics.kernels.ssim import mean_ssim, ssim_map
     from hoigs.rasterizers.warp import WarpRasterizer
+    from hoigs.rasterizers.warp.cuda import intersections
     from hoigs.testing.rasterizer.subject import a_camera, random_gaussians
 
     if not torch.cuda.is_available():
@@ -92,7 +93,9 @@ def work() -> int:
         return 1
     cuda = torch.device("cuda", 0)
     camera = a_camera(70, 45).to(cuda)
-    for count in (1, 400):
+    rule = intersections.MANY, intersections.DENSE
+    for count, in_two_parts in ((1, False), (400, False), (3000, True)):
+        intersections.MANY, intersections.DENSE = (0, 0) if in_two_parts else rule
         gaussians = random_gaussians(count).to(cuda)
         for channels in (0, 6):
             for absolute in (False, True):
@@ -115,6 +118,7 @@ def work() -> int:
                     loss.backward()
                     torch.cuda.synchronize()
                     print(f"drawn {count} {channels} {absolute} {room} {float(loss):.6f}")
+    intersections.MANY, intersections.DENSE = rule
     last = camera.world_to_camera.clone()
     last[0, 3] += 0.02
     rolling = {"shutter": "top_to_bottom", "last_world_to_camera": last}

@@ -16,6 +16,8 @@ from hoigs.core.maths.optics import Optics
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.rasterizers.warp import WarpRasterizer
+from hoigs.rasterizers.warp.cuda import intersections
+from hoigs.rasterizers.warp.frame import Images, Inputs, TileIntersections
 from hoigs.testing.rasterizer.subject import on, require_close_gradient
 
 CUDA = torch.device("cuda", 0)
@@ -130,30 +132,107 @@ def test_what_is_hidden_has_no_gradient_whatever_the_memory_held(channels: int) 
         require_close_gradient(name, found[name].cpu(), gradient, 1e-3)  # cut-offs: a splat or so
 
 
-def test_long_lists_are_in_order() -> None:
-    """Thousands of splats in one tile: sorted in pieces, then merged."""
+@pytest.mark.parametrize("depths", ["all different", "two alike", "all alike"])
+def test_long_lists_are_in_order(depths: str) -> None:
+    """Thousands of splats in one tile, all drawn: sorted in chunks, whatever their depths."""
     gaussians, camera = scene(20_000, 20, 20)
-    request = RenderRequest(min_transmittance=0.0)
-    faint = gaussians.replace(opacity_logits=gaussians.opacity_logits * 0.0 - 4.0)
-    rasterizer = WarpRasterizer()
-    pipeline = rasterizer.pipeline(CUDA)
-    from hoigs.rasterizers.warp.frame import Inputs
-
-    settings, tensors = rasterizer.inputs.prepare(faint, camera, request)
-    projected = pipeline.project(Inputs(*tensors), settings)
-    tiles = pipeline.intersect(projected, settings)
+    means = gaussians.means.clone()
+    if depths == "two alike":
+        means[::2] = means[1::2]
+    elif depths == "all alike":
+        toward = camera.world_to_camera[2, :3]
+        means -= (means @ toward - means[0] @ toward)[:, None] * toward
+    faint = gaussians.replace(means=means, opacity_logits=gaussians.opacity_logits * 0.0 - 4.0)
+    tiles, drawn_depths, _ = blended(faint, camera, RenderRequest(min_transmittance=0.0))
     offsets, shared = tiles.offsets[: tiles.tiles + 1].tolist(), tiles.offsets[tiles.tiles + 1]
     assert shared == -1
     assert max(b - a for a, b in pairwise(offsets)) > 5000
+    assert tiles.offsets[2 * tiles.tiles + 2 :][: tiles.tiles].tolist() == offsets[1:]
     partials = []
     for begin, end in pairwise(offsets):
         rows, here = tiles.indices[begin:end].long().unbind(1)
-        keys = projected.drawn_depths[rows].double() * 2**20 + rows.double() / 2**20
+        keys = drawn_depths[rows].view(torch.int32).long() << 32 | rows
         assert (keys[1:] > keys[:-1]).all()
         assert (here >= tiles.first_partial[rows]).all()
         assert (here < tiles.first_partial[rows] + tiles.tiles_per_gaussian[rows]).all()
         partials.append(here)
     assert torch.equal(torch.cat(partials).sort().values, torch.arange(offsets[-1], device=CUDA))
+
+
+def test_what_is_hidden_is_not_sorted_and_what_is_drawn_is_in_order() -> None:
+    gaussians, camera = scene(20_000, 60, 40)
+    opaque = gaussians.replace(opacity_logits=gaussians.opacity_logits.abs() + 1)
+    some, _, images = blended(opaque, camera, RenderRequest())
+    every, _, _ = blended(opaque, camera, RenderRequest(min_transmittance=0.0))
+    read = 0
+    for tile in range(some.tiles):
+        begin, end = some.offsets[tile], some.offsets[2 * some.tiles + 2 + tile]
+        assert torch.equal(some.indices[begin:end, 0], every.indices[begin:end, 0])
+        read += int(end - begin)
+    assert read < 0.5 * int(some.offsets[some.tiles])
+    assert images.alpha.mean() > 0.99
+
+
+def blended(
+    gaussians: Gaussians, camera: Camera, request: RenderRequest
+) -> tuple[TileIntersections, Tensor, Images]:
+    """Intersections as far as they were drawn, depths and images, from the stages of a render."""
+    rasterizer = WarpRasterizer()
+    settings, tensors = rasterizer.inputs.prepare(gaussians, camera, request)
+    pipeline, inputs = rasterizer.pipeline(CUDA), Inputs(*tensors)
+    projected = pipeline.project(inputs, settings)
+    tiles = pipeline.intersect(projected, settings)
+    return tiles, projected.drawn_depths, pipeline.blend(inputs, settings, projected.records, tiles)
+
+
+@pytest.mark.parametrize("opacity", [-4.0, 0.0, 4.0])
+@pytest.mark.parametrize("channels", [0, 6])
+def test_the_nearest_before_the_others_draw_the_same(
+    opacity: float, channels: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the nearest leave all tiles open, some, and few."""
+    gaussians, camera = scene(6000)
+    gaussians = gaussians.replace(opacity_logits=gaussians.opacity_logits + opacity)
+    features = torch.randn(6000, channels, device=CUDA) if channels else None
+    request = RenderRequest(features=features, absolute_gradients=torch.zeros(6000, 2, device=CUDA))
+    wanted = drawn(WarpRasterizer(), gaussians, camera, request)
+    in_two_parts(monkeypatch)
+    rasterizer = WarpRasterizer()
+    capacity = rasterizer.pipeline(CUDA).capacity
+    for time in ("first", "second", "without memory", "with some", "with all"):
+        if time == "without memory":
+            needed = int(capacity.largest[0])
+            capacity._capacity = 6000
+            capacity._largest[0] = capacity.largest[0] = 0
+        actual = drawn(rasterizer, gaussians, camera, request)
+        torch.cuda.synchronize()
+        for name, image in wanted[0].items():
+            assert torch.equal(actual[0][name], image), (time, name)
+        for name, gradient in wanted[1].items():
+            assert_close_gradient(name, actual[1][name], gradient)
+        if time == "first":
+            first = actual
+        elif time in ("second", "with all"):
+            assert all(torch.equal(actual[1][name], first[1][name]) for name in first[1]), time
+    assert int(capacity.largest[0]) == needed > 6000, "the intersections fit: this tests nothing"
+
+
+def in_two_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(intersections, "MANY", 0)
+    monkeypatch.setattr(intersections, "DENSE", 0)
+
+
+def test_the_nearest_before_the_others_can_be_captured(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_two_parts(monkeypatch)
+    gaussians, camera = scene(20_000, 300, 200)
+    opaque = gaussians.replace(opacity_logits=gaussians.opacity_logits + 4.0)
+    rasterizer = WarpRasterizer()
+    draw = rasterizer.capture(opaque, camera)
+    assert torch.equal(draw().color, rasterizer.render(opaque, camera).color)
+    wanted = rasterizer.render(gaussians, camera).color
+    for _ in range(2):  # more intersections than there was memory, then captured again
+        assert torch.equal(draw(gaussians=gaussians).color, wanted)
+        torch.cuda.synchronize()
 
 
 @pytest.mark.parametrize("absolute", [False, True])

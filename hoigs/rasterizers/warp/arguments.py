@@ -25,10 +25,10 @@ class Projected:
 
     def __init__(self, like: Tensor, count: int) -> None:
         self.records = like.new_empty(count, RECORD)
-        self.means2d = like.new_empty(count, 2)
-        self.depths = like.new_empty(count)
-        self.drawn_depths = like.new_empty(count)
-        self.radii = like.new_empty(count)
+        # one allocation, since the first kernel waits for it
+        numbers = like.new_empty(5 * count).split([2 * count, count, count, count])
+        means2d, self.depths, self.drawn_depths, self.radii = numbers
+        self.means2d = means2d.view(count, 2)
 
 
 def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> list[Any]:
@@ -50,7 +50,6 @@ class Gradients:
     """What `kernels.project_adjoint` writes, in the shapes of the inputs."""
 
     def __init__(self, inputs: Inputs, pose: bool, absolute: bool, optics: bool = False) -> None:
-        self.with_pose, self.absolute = pose, absolute
         self.means = torch.empty_like(inputs.means)
         self.quats = torch.empty_like(inputs.quats)
         self.log_scales = torch.empty_like(inputs.log_scales)
@@ -93,19 +92,25 @@ class Gradients:
 def adjoint_arguments(
     inputs: Inputs,
     settings: Settings,
+    sh: Tensor,
+    active_bases: int,
     records: Tensor,
-    intersections: TileIntersections,
+    first_partial: Tensor,
+    partial_counts: Tensor,
     partials: Tensor,
     out: Gradients,
 ) -> list[Any]:
-    """Arguments of `kernels.project_adjoint` but for its last two, the range of Gaussians."""
+    """Arguments of `kernels.project_adjoint` but for its last two, the range of Gaussians.
+
+    Of `sh` no bases are given where another kernel differentiates the colours.
+    """
     return [
-        *(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.sh),
-        *(inputs.sh.shape[1], settings.active_bases, inputs.channels),
+        *(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, sh),
+        *(sh.shape[1], active_bases, inputs.channels),
         *(inputs.screen_offsets, int(inputs.screen_offsets.numel() > 0)),
         *(inputs.K, inputs.world_to_camera, settings.width, settings.height),
         *(settings.low_pass, int(settings.antialiased)),
-        *(records, intersections.first_partial, intersections.tiles_per_gaussian, partials),
+        *(records, first_partial, partial_counts, partials),
         *(out.means, out.quats, out.log_scales, out.opacity_logits, out.sh),
         *(out.screen_offsets, out.features, out.absolutes, ABSOLUTES * int(len(out.absolutes) > 0)),
         *(out.all_poses, len(out.pose)),

@@ -11,6 +11,13 @@ from torch import Tensor
 from hoigs.core.first_order import first_order
 from hoigs.rasterizers.warp.frame import Images, Inputs, Settings, TileIntersections
 
+INPUTS = len(fields(Inputs))
+
+
+def zeros(image: Tensor) -> Tensor:
+    """A gradient for an image that has none; it is launched only where there are numbers."""
+    return torch.zeros_like(image) if image.numel() else image
+
 
 class Render(torch.autograd.Function):
     """Inputs in the order of `Inputs`; outputs are the four of `Images`, means2d, depths, radii.
@@ -45,15 +52,12 @@ class Render(torch.autograd.Function):
     @staticmethod
     @first_order("WarpRasterizer", "draw with rasterizer:torch, which has the second, too")
     def backward(ctx: Any, *upstream: Tensor | None) -> tuple[Tensor | None, ...]:
-        from hoigs.rasterizers.warp.arguments import Gradients  # loads Warp
-
         saved = ctx.saved_tensors
-        count = len(fields(Inputs))
-        inputs, (records, *saved) = Inputs(*saved[:count]), saved[count:]
+        inputs, (records, *saved) = Inputs(*saved[:INPUTS]), saved[INPUTS:]
         intersections, images = TileIntersections(*ctx.tiling, *saved[:4]), Images(*saved[4:])
         v = Images(
             *(
-                torch.zeros_like(image) if x is None else x.contiguous()
+                x.contiguous() if x is not None else zeros(image)
                 for image, x in zip(saved[4:], upstream)
             )
         )
@@ -61,8 +65,10 @@ class Render(torch.autograd.Function):
         with torch.cuda.device_of(inputs.means):
             moving = bool(needs.K) and ctx.settings.optics
             pose = bool(needs.world_to_camera) or moving
-            out = Gradients(inputs, pose, bool(needs.absolute_gradients), ctx.settings.optics)
-            ctx.pipeline.gradients(inputs, ctx.settings, records, intersections, images, v, out)
+            out = ctx.pipeline.gradients(
+                inputs, ctx.settings, records, intersections, images, v, pose,
+                bool(needs.absolute_gradients),
+            )  # fmt: skip
         background = None
         if needs.background:
             background = v.color * (1.0 - images.alpha)[..., None]

@@ -78,7 +78,7 @@ class Inputs:
 
 @dataclass(frozen=True)
 class TileIntersections:
-    """The Gaussians of each tile, nearest first.
+    """The Gaussians of each tile, nearest first; on CUDA once they have been blended.
 
     Attributes:
         tile_height: pixels; tiles_x, tiles_y: number of tiles.
@@ -87,6 +87,8 @@ class TileIntersections:
         indices: [M, 2] int32, of each intersection the Gaussian and the partial (`common.records`).
         first_partial: [N] int32, the first partial of each Gaussian.
         tiles_per_gaussian: [N] int32, how many tiles, and so partials, each Gaussian has.
+        keys, owners: what `blend` sorts on CUDA, see `intersect.cuda_kernels`; for it alone.
+        counted: what `cuda.intersections` needs to add the other Gaussians to the nearest.
     """
 
     tile_height: int
@@ -96,6 +98,9 @@ class TileIntersections:
     indices: Tensor
     first_partial: Tensor
     tiles_per_gaussian: Tensor
+    keys: Tensor | None = None
+    owners: Tensor | None = None
+    counted: list[Any] | None = None
 
     @property
     def tiles(self) -> int:

@@ -51,10 +51,15 @@ class WarpRasterizer(Rasterizer):
     pixels than any before it waits for the device, to count its tile intersections (pairs of a
     Gaussian and a tile that it touches). Later renders allocate memory for 1.5 times the largest
     number so far. A view that exceeds it is still drawn right, with the same picture, but some
-    times slower, its gradients are summed in no fixed order, and the next one allocates more. A
-    render holds 20 bytes for each intersection (12 of them shared by all renders of a stream), its
-    backward 4 (10 + feature channels) more, and 92 bytes for each Gaussian, gradients apart. Steps
-    can be captured in a CUDA graph after a first one; `capture` does that for rendering.
+    times slower, its gradients are summed in no fixed order, and the next one allocates more (after
+    two such views, where Gaussians are many). A render holds 20 bytes for each intersection (12 of
+    them until it is drawn), its backward 4 (10 + feature channels) more, and 92 bytes for each
+    Gaussian, gradients apart. Steps can be captured in a CUDA graph after a first one; `capture`
+    does that for rendering.
+
+    From 262,144 Gaussians and 48 for each 128 pixels on, the nearest sixth is drawn first. Of the
+    others, only those are taken, and counted as intersections, that meet a tile where some pixel is
+    not opaque yet.
 
     Raises:
         RenderError: at the first render: Warp is not installed, or the requested kernels or

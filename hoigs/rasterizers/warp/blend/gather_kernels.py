@@ -35,12 +35,16 @@ _GATHER = r"""
     const int own_tiles = own ? tiles_per_gaussian_[row] : 0;
     if (own_tiles > FEW) rows_listed[atomicAdd(&listed, 1)] = row;
     // which partials of the lane's row were written, as bits
-    static_assert(FEW <= 64, "there are 64 bits");
+    static_assert(FEW <= 64 - 8, "there are 64 bits");
     unsigned long long own_bits = 0;
-    if (own_tiles <= FEW) {
-        #pragma unroll 8
-        for (int j = 0; j < own_tiles; ++j)
-            own_bits |= (unsigned long long)written_[own_first + j] << j;
+    if (own_tiles > 0 && own_tiles <= FEW) {
+        const int before = own_first & 7;  // marks in the first of the words of eight
+        const unsigned long long* words =
+            (const unsigned long long*)(written_ + own_first - before);
+        #pragma unroll 4
+        for (int j = 0; j < before + own_tiles; j += 8)  // the product gathers the lowest bits
+            own_bits |= words[j / 8] * 0x0102040810204080ull >> 56 << j;
+        own_bits = own_bits >> before & ((1ull << own_tiles) - 1);
     }
     if (own && own_tiles <= FEW) drawn_[row] = own_bits != 0;
     __syncthreads();

@@ -8,7 +8,7 @@ Their C++ stands in `pixel_source`; threads are numbered 32 tile + lane.
 from hoigs.core.fast.launch import CPU_FLAGS
 from hoigs.core.system.quiet_warp import wp
 from hoigs.rasterizers.warp.blend import pixel_source
-from hoigs.rasterizers.warp.records import F32, I32, U8
+from hoigs.rasterizers.warp.records import F32, I32, I64, U8
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": CPU_FLAGS})
 
@@ -20,20 +20,25 @@ def forward_native(
     thread: int, tiles: int, tiles_x: int, width: int, height: int, max_alpha: float,
     log2_min_alpha: float, min_transmittance: float, records: F32, indices: I32, offsets: I32,
     features: F32, channels: int, background: F32, background_stride: int, color: F32,
-    alpha: F32, depth: F32, feature_image: F32,
+    alpha: F32, depth: F32, feature_image: F32, keys: I64, owners: I32, part: int,
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=BLOCK)
+@wp.kernel(launch_bounds=(BLOCK, 5))
 def forward_pixels(
     tiles: int, tiles_x: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
     min_transmittance: float,  # negative: never stop
-    records: F32, indices: I32, offsets: I32,
+    records: F32,
+    indices: I32,  # [intersections, 2]: Gaussian, partial; on CUDA written, but for a shared list
+    offsets: I32,
     features: F32,  # [N, channels]
     channels: int,
     background: F32,  # [3] with stride 0, or [H, W, 3] with stride 3
     background_stride: int, color: F32, alpha: F32, depth: F32,
     feature_image: F32,  # [H, W, channels]
+    keys: I64,  # on CUDA, as `intersect.cuda_kernels` have them; indices are sorted on a CPU
+    owners: I32,  # likewise
+    part: int,  # of the Gaussians, as there
     base: int, count: int,
 ):  # fmt: skip
     thread = wp.tid() + base
@@ -41,7 +46,7 @@ def forward_pixels(
         forward_native(
             thread, tiles, tiles_x, width, height, max_alpha, log2_min_alpha, min_transmittance,
             records, indices, offsets, features, channels, background, background_stride, color,
-            alpha, depth, feature_image,
+            alpha, depth, feature_image, keys, owners, part,
         )  # fmt: skip
 
 
@@ -55,7 +60,7 @@ def backward_native(
 ): ...  # fmt: skip
 
 
-@wp.kernel(launch_bounds=BLOCK)
+@wp.kernel(launch_bounds=(BLOCK, 5))
 def backward_pixels(
     tiles: int, tiles_x: int, width: int, height: int, max_alpha: float, log2_min_alpha: float,
     min_transmittance: float, records: F32, indices: I32, offsets: I32, features: F32,

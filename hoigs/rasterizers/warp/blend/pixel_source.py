@@ -6,6 +6,10 @@ splat's gradient over the tile take 12 shuffles: each exchange also halves how m
 keeps. There are no barriers beyond the warp and no atomics, and sums have the same order in every
 run.
 
+On CUDA the forward pass sorts a tile's intersections by depth, a chunk at a time, and only as many
+as it draws: where much is hidden, that is the twentieth part. It writes them where the backward
+pass reads them.
+
 On CUDA all tiles may share one list of Gaussians instead (see `warp.cuda.intersections`). Of each
 32, the warp then takes those whose box touches its tile, and adds its sums by atomics.
 
@@ -16,6 +20,7 @@ On a CPU the lanes run one after the other, and each adds its own share to the p
 The arguments are described in `pixel_kernels`.
 """
 
+from hoigs.rasterizers.warp.intersect.cuda_source import IN_REGISTERS, STATE
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 
 LANES = 32
@@ -25,11 +30,12 @@ WARPS = 4  # of a block
 
 _HEAD = r"""
     constexpr int P = %(PIXELS)d, STEP = 32 / %(TILE_WIDTH)d;  // rows between a lane's pixels
-    const int* offsets_ = (const int*)offsets.data;
     const int lane = thread & 31;
 #if defined(__CUDA_ARCH__)
-    const int tile = offsets_[tiles + 3 + (thread >> 5)];
+    %(STATE)s
+    const int tile = order_[thread >> 5];
 #else
+    const int* offsets_ = (const int*)offsets.data;
     const int tile = thread >> 5;
 #endif
     const int left = tile %% tiles_x * %(TILE_WIDTH)d, top = tile / tiles_x * %(TILE_HEIGHT)d;
@@ -37,7 +43,7 @@ _HEAD = r"""
     const float* records_ = (const float*)records.data;
     const float* features_ = (const float*)features.data;
     const float* background_ = (const float*)background.data;
-    const int* indices_ = (const int*)indices.data;
+    int* indices_ = (int*)indices.data;
     float* color_ = (float*)color.data;
     float* alpha_ = (float*)alpha.data;
     float* depth_ = (float*)depth.data;
@@ -47,10 +53,10 @@ _HEAD = r"""
     const unsigned ALL = 0xffffffffu;
     __shared__ float4 staged[%(WARPS)d * 32 * 3];
     float4* stage = staged + (threadIdx.x >> 5) * 32 * 3;
-    const bool shared_list = offsets_[tiles + 1] >= 0;
+    const bool shared_list = *shared_length >= 0;
     if (shared_list) {
         begin = 0;
-        end = offsets_[tiles + 1];
+        end = *shared_length;
     }
     auto any = [&](bool here) -> bool { return __any_sync(ALL, here); };
     auto exp2_of = [](float e) -> float {
@@ -77,57 +83,157 @@ _STATE = r"""
         }
 """
 
+# Sorts the next of a tile's keys, and says how many: some hundred, all where that is less. They are
+# those from `least` on and less than a bound, which a sample of the keys tells; where more than
+# SIZE are, the bound is a quantile of those. Rows of 16 in `chunk` have a gap behind them, as a
+# lane puts so many, one after the other, which would all lie in one bank. This is called, not
+# inlined, since it takes more registers than drawing, and drawing is slow with so many.
+_CHUNK = (
+    r"""
+    struct Chunk {
+        typedef unsigned long long Key;
+        enum { SIZE = 512, SAMPLE = 256, AIM = 192, FLIGHT = 4, LENGTH = SIZE + SIZE / 16 + 1 };
+        static __device__ int slot(int i) { return i + i / 16; }
+        // how many are kept with these
+        static __device__ int keep(Key* chunk, Key key, bool wanted, int kept) {
+            const unsigned all_wanted = __ballot_sync(0xffffffffu, wanted);
+            const int to = kept + __popc(all_wanted & ((1u << (threadIdx.x & 31)) - 1u));
+            if (wanted && to < SIZE) chunk[slot(to)] = key;
+            return kept + __popc(all_wanted);
+        }
+        static __device__ __noinline__ void sort(Key* chunk, int n) {
+            const int lane = threadIdx.x & 31;
+"""
+    + IN_REGISTERS
+    + r"""
+            __syncwarp();
+            auto get = [&](int i) { return chunk[slot(i)]; };
+            auto put = [&](int i, Key key) { chunk[slot(i)] = key; };
+            if (n > 256) sort_in_registers(K16(), n, get, put);
+            else if (n > 128) sort_in_registers(K8(), n, get, put);
+            else if (n > 64) sort_in_registers(K4(), n, get, put);
+            else if (n > 32) sort_in_registers(K2(), n, get, put);
+            else sort_in_registers(K1(), n, get, put);
+            __syncwarp();
+        }
+        // Gaussians and partials go to `to`; behind the chunk stands from where on keys are left
+        static __device__ __noinline__ int sort_next(Key* chunk, const Key* keys, int2* to,
+                                                     const int* owners, int number,
+                                                     int number_sorted) {
+            const int lane = threadIdx.x & 31, left_over = number - number_sorted;
+            if (left_over == 0) return 0;
+            const Key least = number_sorted > 0 ? chunk[LENGTH - 1] : 0;
+            Key bound = ~0ull;
+            if (left_over > SIZE) {
+                int kept = 0;
+                for (int j = 0; j < SAMPLE / 32; ++j) {
+                    const Key key = keys[(long long)(32 * j + lane) * number / SAMPLE];
+                    kept = keep(chunk, key, key >= least, kept);
+                }
+                if (kept > 1) {
+                    sort(chunk, kept);
+                    const int rank = AIM * kept / left_over;
+                    bound = chunk[slot(rank > 1 ? rank : 1)];
+                }
+            }
+            int found;
+            for (;;) {
+                __syncwarp();
+                found = 0;
+                for (int i = lane; i - lane < number; i += 32 * FLIGHT) {
+                    Key key[FLIGHT];
+                    #pragma unroll
+                    for (int j = 0; j < FLIGHT; ++j)
+                        key[j] = i + 32 * j < number ? keys[i + 32 * j] : ~0ull;
+                    #pragma unroll
+                    for (int j = 0; j < FLIGHT; ++j)
+                        found = keep(chunk, key[j], key[j] >= least && key[j] < bound, found);
+                }
+                sort(chunk, found < SIZE ? found : SIZE);
+                if (found <= SIZE) break;
+                const int rank = (long long)AIM * SIZE / found;
+                bound = chunk[slot(rank > 1 ? rank : 1)];
+            }
+            for (int i = lane; i < found; i += 32 * FLIGHT) {
+                int partial[FLIGHT], owner[FLIGHT];
+                #pragma unroll
+                for (int j = 0; j < FLIGHT; ++j) {
+                    if (i + 32 * j >= found) continue;
+                    partial[j] = (int)chunk[slot(i + 32 * j)];
+                    owner[j] = owners[partial[j]];
+                }
+                #pragma unroll
+                for (int j = 0; j < FLIGHT; ++j)
+                    if (i + 32 * j < found)
+                        to[number_sorted + i + 32 * j] = make_int2(owner[j], partial[j]);
+            }
+            if (lane == 0) chunk[LENGTH - 1] = bound;
+            __syncwarp();
+            return found;
+        }
+    };
+    __shared__ Chunk::Key chunks[%(WARPS)d * Chunk::LENGTH];
+    __shared__ float put_aside[%(WARPS)d * 32 * P * 5];
+    auto sort_next = [&](int number_sorted) -> int {
+        const int from = others ? others_[tile] : offsets_[tile];
+        return Chunk::sort_next(
+            chunks + (threadIdx.x >> 5) * Chunk::LENGTH, (const Chunk::Key*)keys.data + from,
+            (int2*)indices_ + from, (const int*)owners.data,
+            (others ? others_ : offsets_)[tile + 1] - from, number_sorted);
+    };
+"""
+)
+
 # The loop over the tile's intersections, as long as some pixel goes on. It opens blocks that DONE
 # closes; `continue` skips a splat. `exponent[i]` is log2 of alpha before the clamp, `on[i]` whether
 # pixel i is hit.
 _EACH = r"""
         int at = begin;
 #if defined(__CUDA_ARCH__)
-        #define DONE } at += 32; }
-        int2 index;
-        float4 first, second, third;
-        auto fetch = [&](int from) {
-            if (from + lane >= end) return;
-            index = ((const int2*)indices_)[from + lane];
-            const float4* record = (const float4*)records_ + 4ll * index.x;
-            first = record[0];
-            second = record[1];
-            third = record[2];
-        };
-        fetch(at);
-        while (at < end) {
-            bool running = false;
+        #define DONE } at += 32; } }
+        auto running = [&]() -> bool {
+            bool some = false;
             #pragma unroll
-            for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
-            if (!any(running)) break;
-            bool mine = at + lane < end;
-            if (shared_list && mine)  // one pixel more than the box: rounding loses nothing
-                mine = first.x + third.z > (float)left - 1.0f
-                    && first.x - third.z < (float)(left + %(TILE_WIDTH)d) + 1.0f
-                    && first.y + third.w > (float)top - 1.0f
-                    && first.y - third.w < (float)(top + %(TILE_HEIGHT)d) + 1.0f;
-            const unsigned taken = __ballot_sync(ALL, mine);
-            __syncwarp();  // the records before these have been read
-            if (mine) {
-                float4* to = stage + 3 * __popc(taken & ((1u << lane) - 1u));
-                to[0] = first;
-                to[1] = second;
-                to[2] = make_float4(third.x, third.y, __int_as_float(index.x),
-                                    __int_as_float(index.y));
-            }
-            __syncwarp();
-            fetch(at + 32);  // on their way while these are drawn
-            const int number = __popc(taken);
-            for (int k = 0; k < number; ++k) {
+            for (int i = 0; i < P; ++i) some |= T[i] > 0.0f;
+            return any(some);
+        };
+        for (int stretch = 0; running(); ++stretch) {  // from `at` to `end` all are in order
+            %(STRETCH)s
+            int2 index;
+            auto fetch = [&](int from) {
+                if (from + lane < end) index = ((const int2*)indices_)[from + lane];
+            };
+            fetch(at);
+            while (at < end && running()) {
+                bool mine = at + lane < end;
+                __syncwarp();  // the records before these have been read
+                if (mine) {
+                    const float4* record = (const float4*)records_ + 4ll * index.x;
+                    const float4 first = record[0], third = record[2];
+                    stage[3 * lane] = first;
+                    stage[3 * lane + 1] = record[1];
+                    stage[3 * lane + 2] = make_float4(third.x, third.y, __int_as_float(index.x),
+                                                      __int_as_float(index.y));
+                    if (shared_list)  // one pixel more than the box: rounding loses nothing
+                        mine = first.x + third.z > (float)left - 1.0f
+                            && first.x - third.z < (float)(left + %(TILE_WIDTH)d) + 1.0f
+                            && first.y + third.w > (float)top - 1.0f
+                            && first.y - third.w < (float)(top + %(TILE_HEIGHT)d) + 1.0f;
+                }
+                const unsigned taken = __ballot_sync(ALL, mine);
+                __syncwarp();
+                fetch(at + 32);  // on their way while these are drawn
+                for (int k = 0; k < 32 - __clz(taken); ++k) {
+                    if (shared_list && !(taken >> k & 1)) continue;
                 const float4 g0 = stage[3 * k], g1 = stage[3 * k + 1], g2 = stage[3 * k + 2];
                 const int row = __float_as_int(g2.z), partial = __float_as_int(g2.w);
 #else
         #define DONE }
         struct Four { float x, y, z, w; };
         for (; at < end; ++at) {
-                bool running = false;
-                for (int i = 0; i < P; ++i) running |= T[i] > 0.0f;
-                if (!running) break;
+                bool some = false;
+                for (int i = 0; i < P; ++i) some |= T[i] > 0.0f;
+                if (!some) break;
                 const int row = indices_[2 * at], partial = indices_[2 * at + 1];
                 const float* g = records_ + 16ll * row;
                 const Four g0 = {g[0], g[1], g[2], g[3]}, g1 = {g[4], g[5], g[6], g[7]};
@@ -154,6 +260,44 @@ _EACH = r"""
                                                       : 0.0f;
 """
 
+# How passes read on: the first one forward sorts what it draws, the others read what is sorted.
+# What the nearest leave open is drawn once more when the others are there: their list follows. What
+# the call of `sort_next` has to keep is put aside, or the loop that draws would be without
+# registers for it.
+_SORTING = r"""
+            if (shared_list) {
+                if (stretch > 0) break;
+            } else if (others && stretch == 0) {
+                end = sorted_until_[tile];
+            } else {
+                if (others && stretch == 1) end = others_[tile];
+                if (!others && stretch == 0) end = begin;
+                at = end;
+                float* aside = put_aside + threadIdx.x;
+                #pragma unroll
+                for (int i = 0; i < P; ++i) {
+                    aside[(5 * i + 4) * blockDim.x] = T[i];
+                    for (int j = 0; j < 4; ++j) aside[(5 * i + j) * blockDim.x] = sums[i][j];
+                }
+                end += sort_next(at - (others ? others_[tile] : begin));
+                #pragma unroll
+                for (int i = 0; i < P; ++i) {
+                    T[i] = aside[(5 * i + 4) * blockDim.x];
+                    for (int j = 0; j < 4; ++j) sums[i][j] = aside[(5 * i + j) * blockDim.x];
+                }
+                if (at == end) break;
+            }
+"""
+_SORTED = r"""
+            if (stretch == 0) {
+                if (!shared_list) end = sorted_until_[tile];
+            } else {
+                if (stretch == 2 || shared_list || !open_[tile]) break;
+                at = others_[tile];
+                end = others_until_[tile];
+            }
+"""
+
 _FORWARD = r"""
         float sums[P][4] = {};
         %(EACH)s
@@ -172,6 +316,18 @@ _FORWARD = r"""
                 }
         DONE
         #undef DONE
+#if defined(__CUDA_ARCH__)
+        if (COLOR && lane == 0) (others ? others_until_ : sorted_until_)[tile] = end;
+        if (COLOR && !others) {
+            const bool open = part == 1 && !shared_list && running();
+            if (lane == 0) {
+                open_[tile] = open;
+                if (open) atomicAdd(number_open, 1);
+            }
+            if (open) return;  // the others follow
+        }
+        __syncwarp();
+#endif
         #pragma unroll
         for (int i = 0; i < P; ++i) {
             if (!inside[i]) continue;
@@ -349,26 +505,38 @@ _SIZES = {
     "TILE_WIDTH": TILE_WIDTH,
     "TILE_HEIGHT": TILE_HEIGHT,
     "WARPS": WARPS,
+    "STATE": STATE,
 }
 
 
-def _filled(body: str) -> str:
-    one = _STATE + body % {"EACH": _EACH % _SIZES}
+def _filled(body: str, start: str, color: str) -> str:
+    """Colours and depth, read on as `color` says, then four feature channels at a time."""
+    first, further = (
+        _STATE + body % {"EACH": _EACH % (_SIZES | {"STRETCH": stretch})}
+        for stretch in (color, _SORTED)
+    )
     return f"""{_HEAD % _SIZES}
+#if defined(__CUDA_ARCH__)
+    {start}
+#endif
     {{
         constexpr bool COLOR = true;
         constexpr int channel = 0;
         (void)channel;
-        {one}
+        {first}
     }}
     for (int channel = 0; channel < channels; channel += 4) {{
         constexpr bool COLOR = false;
-        {one}
+        {further}
     }}
 """
 
 
-FORWARD = _filled(_FORWARD)
-_GRADIENTS = _UPSTREAM + _filled(_BACKWARD)
+_SECOND_TIME = r"""
+    const bool others = part == 2 && !shared_list;
+    if (part == 2 && (shared_list ? !*restarted : !open_[tile])) return;
+"""
+FORWARD = _filled(_FORWARD, _SECOND_TIME + _CHUNK % _SIZES, _SORTING)
+_GRADIENTS = _UPSTREAM + _filled(_BACKWARD, "", _SORTED)
 BACKWARD = "constexpr bool ABSOLUTE = false;" + _GRADIENTS
 ABSOLUTE = "constexpr bool ABSOLUTE = true;" + _GRADIENTS

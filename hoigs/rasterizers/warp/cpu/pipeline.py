@@ -46,7 +46,8 @@ class CpuPipeline(ABC):
     forward_kernel: ClassVar[Any]
     backward_kernel: ClassVar[Any]
     absolute_kernel: ClassVar[Any]  # backward, with absolute gradients
-    further: ClassVar[tuple[Tensor, ...]] = ()  # what the backward kernels take besides
+    # what the kernels take besides, forward and backward
+    further: ClassVar[tuple[tuple[Any, ...], tuple[Any, ...]]] = ((), ())
 
     def __init__(self, cores: Cores) -> None:
         self.cores = cores
@@ -70,6 +71,7 @@ class CpuPipeline(ABC):
     ) -> Images:
         images = Images.empty(inputs, settings)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
+        arguments += self.further[0]
         self._tiles(self.forward_kernel, intersections, arguments)
         return images
 
@@ -81,19 +83,25 @@ class CpuPipeline(ABC):
         intersections: TileIntersections,
         images: Images,
         upstream: Images,
-        out: Gradients,
-    ) -> None:
-        """Fill in `out`."""
-        count, stride = intersections.count, MOMENTS + inputs.channels + ABSOLUTES * out.absolute
+        pose: bool,
+        absolute: bool,
+    ) -> Gradients:
+        """Of all inputs; of the pose, and absolute ones, where they are asked for."""
+        out = Gradients(inputs, pose, absolute, settings.optics)
+        count, stride = intersections.count, MOMENTS + inputs.channels + ABSOLUTES * absolute
         check_addressable(count * stride, f"{count} tile intersections")
         partials = inputs.means.new_zeros(count, stride)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
-        arguments += [*upstream_arguments(upstream, partials), *self.further]
-        kernel = self.absolute_kernel if out.absolute else self.backward_kernel
+        arguments += [*upstream_arguments(upstream, partials), *self.further[1]]
+        kernel = self.absolute_kernel if absolute else self.backward_kernel
         self._tiles(kernel, intersections, arguments)
-        arguments = adjoint_arguments(inputs, settings, records, intersections, partials, out)
+        of_gaussian = [intersections.first_partial, intersections.tiles_per_gaussian]
+        arguments = adjoint_arguments(
+            inputs, settings, inputs.sh, settings.active_bases, records, *of_gaussian, partials, out
+        )
         kernel = (optics if settings.optics else pinhole).project_adjoint
         self.cores.each(kernel, inputs.count, arguments)
+        return out
 
     @abstractmethod
     def _tiles(self, kernel: Any, intersections: TileIntersections, arguments: list[Any]) -> None:
@@ -174,7 +182,10 @@ class PortablePipeline(CpuPipeline):
 
     forward_kernel, backward_kernel = pixel_kernels.forward_pixels, pixel_kernels.backward_pixels
     absolute_kernel = scalar_absolute_kernels.absolute_pixels
-    further = (torch.empty(0, dtype=torch.uint8),)
+    further = (
+        (torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.int32), 0),
+        (torch.empty(0, dtype=torch.uint8),),
+    )
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
         depths, height = projected.drawn_depths, pixel_source.TILE_HEIGHT

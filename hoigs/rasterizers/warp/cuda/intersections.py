@@ -1,11 +1,16 @@
-"""Tile intersections on CUDA, found and sorted without waiting for the device.
+"""Tile intersections on CUDA, found without waiting for the device.
 
 No kernel's size depends on how many intersections there are:
 
     count    a thread a Gaussian: how many tiles its ellipse touches, and one more for each of them
     plan     one block: running sums over tiles and Gaussians, and whether the intersections fit
     place    a thread a Gaussian: its keys (depth, partial) into its tiles, in any order
-    sort     a warp or a block a tile: by depth; partials are numbered by Gaussian, so ties by index
+
+`blend` sorts them by depth, as far as it draws. Partials are numbered by Gaussian, so that ties are
+broken by index.
+
+Where Gaussians are many, most of them are hidden, and so are most intersections. There all this is
+done for the nearest sixth, and once that is drawn, for the others in tiles that it leaves open.
 
 `Scratch.counts` is zero before and after, since `place` counts down where `count` counted up.
 
@@ -28,7 +33,7 @@ from hoigs.rasterizers.warp.arguments import Projected
 from hoigs.rasterizers.warp.blend.pixel_source import TILE_HEIGHT
 from hoigs.rasterizers.warp.frame import INT32, Settings, TileIntersections, check_addressable
 from hoigs.rasterizers.warp.intersect import cuda_kernels
-from hoigs.rasterizers.warp.intersect.cuda_source import BLOCK, PLAN_BLOCK, SORT_BLOCK
+from hoigs.rasterizers.warp.intersect.cuda_source import BLOCK, PLAN_BLOCK, STATE_SIZE
 from hoigs.rasterizers.warp.intersect.tile_spans import TILE_WIDTH
 
 # For how many tile intersections to allocate memory, without waiting for the device.
@@ -89,7 +94,10 @@ class IntersectionCapacity:
         return self._capacity
 
 
-SORTED_BY_BLOCK = 4  # tiles; about as many blocks as there are long lists
+# From how many Gaussians on, in all and for each tile, the nearest are drawn before the others.
+# With fewer, the launches take longer than what they save. It depends on nothing else, so that two
+# renders of the same input sum alike.
+MANY, DENSE = 2**18, 48
 
 
 class Scratch:
@@ -97,25 +105,17 @@ class Scratch:
 
     Attributes:
         counts: [tiles] int32, zero between uses. sums: one for each block of Gaussians.
-        keys: [capacity] int64. owners: [capacity] int32.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.counts = torch.zeros(0, dtype=torch.int32, device=device)
         self.sums = torch.empty(0, dtype=torch.int32, device=device)
-        self.keys = torch.empty(0, dtype=torch.int64, device=device)
-        self.owners = torch.empty(0, dtype=torch.int32, device=device)
 
     def for_splats(self, count: int, tiles: int) -> None:
         if self.counts.numel() < tiles:
             self.counts = self.counts.new_zeros(tiles)
         if self.sums.numel() * BLOCK < count:
             self.sums = self.sums.new_empty(-(-count // BLOCK))
-
-    def for_intersections(self, capacity: int) -> None:
-        if self.keys.numel() < capacity:
-            self.keys = self.keys.new_empty(capacity)
-            self.owners = self.owners.new_empty(capacity)
 
 
 class Intersector:
@@ -132,58 +132,80 @@ class Intersector:
 
     def __init__(self, streams: CudaStreams, capacity: IntersectionCapacity) -> None:
         self.streams, self.capacity = streams, capacity
-        self._scratch: dict[int, Scratch] = {}
+        self._scratch: dict[CudaStream, Scratch] = {}
         self._lock = threading.Lock()  # the kernels of two renders must not mix in one scratch
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
+        """Of all Gaussians, or of the nearest of many: where `counted` is given, others follow."""
         tiles_x, tiles_y = -(-settings.width // TILE_WIDTH), -(-settings.height // TILE_HEIGHT)
         count, tiles = projected.depths.shape[0], tiles_x * tiles_y
-        depths, records = projected.drawn_depths, projected.records
+        depths = projected.drawn_depths
         new = depths.new_empty
-        first_partial, tiles_per_gaussian = new((2, count), dtype=torch.int32).unbind()
-        offsets = new(2 * tiles + 3, dtype=torch.int32)
+        sizes = [count, count, 6 * tiles + STATE_SIZE]
+        *of_gaussian, offsets = new(sum(sizes), dtype=torch.int32).split(sizes)
+        splats = [projected.records, depths, count, TILE_HEIGHT, tiles_x, tiles_y, settings.width]
+        many = count >= max(MANY, DENSE * tiles)
+        part = cuda_kernels.NEAR if many else cuda_kernels.ALL
+        stream = self.streams.current(depths.device.index)
         with self._lock:
-            scratch = self._scratch_of_stream(depths.device)
+            scratch = self._scratch_of(stream, depths.device)
             scratch.for_splats(count, tiles)
-            splats = [records, depths, count, TILE_HEIGHT, tiles_x, tiles_y, settings.width]
-            splats += [scratch.counts, first_partial, tiles_per_gaussian, scratch.sums]
-            blocks = -(-count // BLOCK)
-            stream = self.streams.current()
-            stream.blocks(cuda_kernels.count_intersections, blocks, BLOCK, splats)
+            counted = [*splats, scratch.counts, *of_gaussian, scratch.sums, offsets]
             capacity = self.capacity.of(count, tiles)
-            plan = [depths, count, tiles, capacity, 0, scratch.counts, scratch.sums, offsets]
             known = capacity > 0
             if not known:
-                capacity = self._count(stream, plan, offsets, count, tiles)
-            scratch.for_intersections(capacity)
+                capacity = self._measure(stream, counted, tiles, many)
+            if known or many:
+                _count(stream, part, counted)
             indices = new((capacity, 2), dtype=torch.int32)
-            if known:
-                largest = self.capacity.largest, self.capacity.largest_on_host
-                arguments = [*plan, scratch.keys, indices, *largest]
-                stream.blocks(cuda_kernels.plan_intersections, 1, PLAN_BLOCK, arguments)
-            arguments = [*splats, offsets, scratch.keys, scratch.owners]
-            stream.blocks(cuda_kernels.place_intersections, blocks, BLOCK, arguments)
-            sorters = -(-tiles // SORTED_BY_BLOCK)
-            arguments = [sorters, tiles, offsets, scratch.keys, scratch.owners, indices]
-            stream.blocks(cuda_kernels.sort_intersections, sorters, SORT_BLOCK, arguments)
+            keys, owners = new(capacity, dtype=torch.int64), new(capacity, dtype=torch.int32)
+            if known or many:
+                self._plan(stream, part, counted, tiles, capacity, keys, indices)
+            _place(stream, part, counted, keys, owners)
         return TileIntersections(
-            TILE_HEIGHT, tiles_x, tiles_y, offsets, indices, first_partial, tiles_per_gaussian
-        )
+            TILE_HEIGHT, tiles_x, tiles_y, offsets, indices, *of_gaussian, keys, owners,
+            counted if many else None,
+        )  # fmt: skip
 
-    def _count(
-        self, stream: CudaStream, plan: list, offsets: Tensor, count: int, tiles: int
-    ) -> int:
-        """Capacity for this render, by waiting for its number of intersections."""
+    def intersect_others(self, near: TileIntersections) -> None:
+        """Add the other Gaussians where the nearest, once drawn, leave a tile open."""
+        part, depths = cuda_kernels.OTHERS, near.counted[1]
+        stream = self.streams.current(depths.device.index)
+        with self._lock:
+            _count(stream, part, near.counted)
+            self._plan(stream, part, near.counted, near.tiles, near.count, near.keys, near.indices)
+            _place(stream, part, near.counted, near.keys, near.owners)
+        if self.capacity.of(len(depths), near.tiles) == 0:  # `_measure` was for this render alone
+            self.capacity.counted(len(depths), near.tiles, int(self.capacity.largest[0]))
+
+    def _plan(
+        self, stream: CudaStream, part: int, counted: list, tiles: int, capacity: int,
+        keys: Tensor, indices: Tensor,
+    ) -> None:  # fmt: skip
+        _, depths, count, *_, counts, _, _, sums, offsets = counted
+        arguments = [part, depths, count, tiles, capacity, 0, counts, sums, offsets, keys, indices]
+        arguments += [self.capacity.largest, self.capacity.largest_on_host]
+        stream.blocks(cuda_kernels.plan_intersections, 1, PLAN_BLOCK, arguments)
+
+    def _measure(self, stream: CudaStream, counted: list, tiles: int, many: bool) -> int:
+        """Capacity for this render, by waiting for its number of intersections.
+
+        Of many Gaussians it is that of all of them; later renders need less.
+        """
+        _, depths, count, *_, counts, _, _, sums, offsets = counted
         if torch.cuda.is_current_stream_capturing():
             raise RenderError(
                 f"WarpRasterizer: {count} Gaussians and {tiles} tiles are more than it has drawn "
                 "so far, and their intersections cannot be counted while a CUDA graph is captured: "
                 "render once before the capture"
             )
-        plan[4] = 1  # count only
+        _count(stream, cuda_kernels.ALL, counted)
         none = offsets.new_empty(0)
-        largest = self.capacity.largest, self.capacity.largest_on_host
-        arguments = [*plan, none.long(), none, *largest]
+        largest = [self.capacity.largest, self.capacity.largest_on_host]
+        if many:
+            largest = [torch.zeros_like(self.capacity.largest) for _ in range(2)]
+        arguments = [cuda_kernels.ALL, depths, count, tiles, 0, 1, counts, sums, offsets]
+        arguments += [none.long(), none, *largest]
         stream.blocks(cuda_kernels.plan_intersections, 1, PLAN_BLOCK, arguments)
         found = int(offsets[tiles])
         if found == INT32:
@@ -191,14 +213,27 @@ class Intersector:
             check_addressable(
                 INT32 + 1, f"the intersections of {count} Gaussians with {tiles} tiles"
             )
+        if many:
+            counts.zero_()
+            return max(found, count)
         return self.capacity.counted(count, tiles, found)
 
-    def _scratch_of_stream(self, device: torch.device) -> Scratch:
+    def _scratch_of(self, stream: CudaStream, device: torch.device) -> Scratch:
         """Kept for each stream; a graph that is captured gets one of its own."""
         if torch.cuda.is_current_stream_capturing():
             self.capacity.keep_for_graphs()
             return Scratch(device)
-        stream = torch.cuda.current_stream().cuda_stream
         if stream not in self._scratch:
             self._scratch[stream] = Scratch(device)
         return self._scratch[stream]
+
+
+def _count(stream: CudaStream, part: int, counted: list) -> None:
+    blocks = -(-counted[2] // BLOCK)
+    stream.blocks(cuda_kernels.count_intersections, blocks, BLOCK, [part, *counted])
+
+
+def _place(stream: CudaStream, part: int, counted: list, keys: Tensor, owners: Tensor) -> None:
+    blocks = -(-counted[2] // BLOCK)
+    arguments = [part, *counted, keys, owners]
+    stream.blocks(cuda_kernels.place_intersections, blocks, BLOCK, arguments)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -30,6 +28,7 @@ from hoigs.rasterizers.warp.frame import (
     TileIntersections,
     check_addressable,
 )
+from hoigs.rasterizers.warp.intersect import cuda_kernels
 from hoigs.rasterizers.warp.project import kernels as pinhole
 from hoigs.rasterizers.warp.project import optics
 from hoigs.rasterizers.warp.project.spherical_harmonics_adjoint import BLOCK as SH_BLOCK
@@ -43,7 +42,7 @@ class CudaPipeline:
     """Renders on one CUDA device, on torch's current stream."""
 
     def __init__(self, device: torch.device) -> None:
-        self.streams = CudaStreams()
+        self.device, self.streams = device.index, CudaStreams()
         self.capacity = IntersectionCapacity(device)
         self._intersector = Intersector(self.streams, self.capacity)
 
@@ -51,7 +50,7 @@ class CudaPipeline:
         out = Projected(inputs.means, inputs.count)
         arguments = project_arguments(inputs, settings, out)
         kernel = (optics if settings.optics else pinhole).project
-        self.streams.current().each(kernel, inputs.count, arguments)
+        self.streams.current(self.device).each(kernel, inputs.count, arguments)
         return out
 
     def intersect(self, projected: Projected, settings: Settings) -> TileIntersections:
@@ -66,8 +65,14 @@ class CudaPipeline:
     ) -> Images:
         images = Images.empty(inputs, settings)
         arguments = tile_arguments(inputs, settings, records, intersections, images)
-        lanes = intersections.tiles * pixel_source.LANES
-        self.streams.current().each(pixel_kernels.forward_pixels, lanes, arguments, TILE_BLOCK)
+        arguments += [intersections.keys, intersections.owners]
+        lanes, stream = intersections.tiles * pixel_source.LANES, self.streams.current(self.device)
+        kernel, part = pixel_kernels.forward_pixels, cuda_kernels.ALL
+        if intersections.counted is not None:
+            stream.each(kernel, lanes, [*arguments, cuda_kernels.NEAR], TILE_BLOCK)
+            self._intersector.intersect_others(intersections)
+            part = cuda_kernels.OTHERS
+        stream.each(kernel, lanes, [*arguments, part], TILE_BLOCK)
         return images
 
     def gradients(
@@ -78,11 +83,12 @@ class CudaPipeline:
         intersections: TileIntersections,
         images: Images,
         upstream: Images,
-        out: Gradients,
-    ) -> None:
-        """Fill in `out`."""
-        stream, count = self.streams.current(), inputs.count
-        stride = MOMENTS + inputs.channels + ABSOLUTES * out.absolute
+        pose: bool,
+        absolute: bool,
+    ) -> Gradients:
+        """Of all inputs; of the pose, and absolute ones, where they are asked for."""
+        stream, count = self.streams.current(self.device), inputs.count
+        stride = MOMENTS + inputs.channels + ABSOLUTES * absolute
         capacity, tiles = intersections.count, intersections.tiles
         check_addressable(capacity * stride, f"{capacity} tile intersections")
         partials = inputs.means.new_empty(capacity, stride)
@@ -93,26 +99,27 @@ class CudaPipeline:
         arguments = tile_arguments(inputs, settings, records, intersections, images)
         arguments += [*upstream_arguments(upstream, partials), written]
         lanes = tiles * pixel_source.LANES
-        kernel = absolute_kernels.absolute_pixels if out.absolute else pixel_kernels.backward_pixels
+        kernel = absolute_kernels.absolute_pixels if absolute else pixel_kernels.backward_pixels
         stream.each(kernel, lanes, arguments, TILE_BLOCK)
 
+        # allocated while the device is at the pixels
+        out = Gradients(inputs, pose, absolute, settings.optics)
         first, drawn = intersections.first_partial, torch.empty_like(intersections.first_partial)
         of_gaussian = [first, intersections.tiles_per_gaussian]
         arguments = [count, stride, *of_gaussian, written, partials, drawn]
         blocks = -(-count // gather_kernels.ROWS)
         stream.blocks(gather_kernels.gather_partials, blocks, gather_kernels.BLOCK, arguments)
-        gathered = replace(intersections, tiles_per_gaussian=drawn)  # one partial each from here on
-        project_adjoint = (optics if settings.optics else pinhole).project_adjoint
-        if settings.active_bases == 1:
-            arguments = adjoint_arguments(inputs, settings, records, gathered, partials, out)
-            stream.each(project_adjoint, count, arguments)
-            return
-        without_sh = replace(inputs, sh=inputs.sh[:, :0]), replace(settings, active_bases=0)
-        arguments = adjoint_arguments(*without_sh, records, gathered, partials, out)
-        stream.each(project_adjoint, count, arguments)
-        arguments = [
-            *(inputs.means, inputs.sh, inputs.sh.shape[1], settings.active_bases),
-            *(inputs.world_to_camera, records, first, drawn, partials, stride),
-            *(out.sh, out.means, out.pose, int(out.with_pose), count),
-        ]
-        stream.blocks(harmonics_adjoint, -(-count // SH_BLOCK), SH_BLOCK, arguments)
+        apart = settings.active_bases > 1  # the adjoint of harmonics is a kernel of its own
+        sh, active_bases = (inputs.sh[:, :0], 0) if apart else (inputs.sh, settings.active_bases)
+        arguments = adjoint_arguments(
+            inputs, settings, sh, active_bases, records, first, drawn, partials, out
+        )
+        stream.each((optics if settings.optics else pinhole).project_adjoint, count, arguments)
+        if apart:
+            arguments = [
+                *(inputs.means, inputs.sh, inputs.sh.shape[1], settings.active_bases),
+                *(inputs.world_to_camera, records, first, drawn, partials, stride),
+                *(out.sh, out.means, out.pose, int(pose), count),
+            ]
+            stream.blocks(harmonics_adjoint, -(-count // SH_BLOCK), SH_BLOCK, arguments)
+        return out

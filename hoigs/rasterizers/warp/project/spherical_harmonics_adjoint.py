@@ -25,43 +25,63 @@ _ROW = 49  # numbers that a row of the buffer takes: odd, so that rows start in 
 RECORD_C = wp.constant(RECORD)
 POSE_C = wp.constant(POSE)
 
-# Walks the numbers of a warp's rows, `width` each, as they lie in memory: `i` in the array, and
-# `at` in the buffer; `r` is the row's number in the warp.
-_WALK = r"""
+# A warp's rows as they lie in memory, `width` numbers each. Where SPARSE of them or fewer have a
+# gradient, those are moved one by one; else all numbers are walked: `i` in the array, and `at` in
+# the buffer; `r` is the row's number in the warp.
+_SPARSE = 8
+_ROWS = r"""
     const int lane = threadIdx.x & 31, first = row - lane;
     const int rows = count - first < 32 ? count - first : 32;
     float* mine = (float*)buffer + (threadIdx.x - lane) * %(ROW)d;
     float* array = (float*)values.data + (long long)first * width;
-    int r = 0, column = lane;
-    for (int i = lane; i < rows * width; i += 32, column += 32) {
-        while (column >= width) {
-            column -= width;
-            ++r;
+    unsigned visible = __ballot_sync(0xffffffffu, wanted);
+    if (__popc(visible) <= %(SPARSE)d) {
+        %(BEFORE)s
+        for (; visible != 0; visible &= visible - 1) {
+            const int r = __ffs(visible) - 1;
+            for (int column = lane; column < width; column += 32) {
+                const int i = r * width + column, at = r * %(ROW)d + column;
+                %(MOVE)s
+            }
         }
-        const int at = r * %(ROW)d + column;
-        %(MOVE)s
+    } else {
+        int r = 0, column = lane;
+        for (int i = lane; i < rows * width; i += 32, column += 32) {
+            while (column >= width) {
+                column -= width;
+                ++r;
+            }
+            const int at = r * %(ROW)d + column;
+            %(WALK)s
+        }
     }
 """
-
-
-def _walk(move: str) -> str:
-    return _WALK % {"ROW": _ROW, "MOVE": move}
+_LOAD = {"BEFORE": "", "MOVE": "mine[at] = array[i];"}
+_LOAD |= {"WALK": "if (visible >> r & 1) mine[at] = array[i];"}
+# 32 rows begin at a multiple of 16 bytes, whatever the width
+_STORE = {
+    "BEFORE": r"""
+        const float4 zero = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+        for (int i = lane; i < rows * width / 4; i += 32) ((float4*)array)[i] = zero;
+        for (int i = rows * width / 4 * 4 + lane; i < rows * width; i += 32) array[i] = 0.0f;
+        __syncwarp();
+""",
+    "MOVE": "array[i] = mine[at];",
+    "WALK": "array[i] = visible >> r & 1 ? mine[at] : 0.0f;",
+}
+_SIZES = {"ROW": _ROW, "SPARSE": _SPARSE}
 
 
 @wp.func_native(f"__shared__ float rows[{BLOCK * _ROW}]; return (wp::uint64)rows;")
 def row_buffer() -> wp.uint64: ...
 
 
-@wp.func_native(
-    "const unsigned asked = __ballot_sync(0xffffffffu, wanted);"
-    + _walk("if (asked >> r & 1) mine[at] = array[i];")
-    + "__syncwarp();"
-)
+@wp.func_native(_ROWS % (_SIZES | _LOAD) + "__syncwarp();")
 def load_rows(values: F32, buffer: wp.uint64, row: int, count: int, width: int, wanted: bool): ...
 
 
-@wp.func_native("__syncwarp();" + _walk("array[i] = mine[at];"))
-def store_rows(values: F32, buffer: wp.uint64, row: int, count: int, width: int): ...
+@wp.func_native("__syncwarp();" + _ROWS % (_SIZES | _STORE))
+def store_rows(values: F32, buffer: wp.uint64, row: int, count: int, width: int, wanted: bool): ...
 
 
 @wp.func_native(f"return ((float*)buffer)[threadIdx.x * {_ROW} + index];")
@@ -93,9 +113,8 @@ def harmonics_adjoint(
     if row < count:
         visible = drawn[row] != 0
     load_rows(sh, buffer, row, count, 3 * stored_bases, visible)
-    basis = Vec16()
-    v_color = wp.vec3(0.0, 0.0, 0.0)
     if visible:
+        v_color = wp.vec3(0.0, 0.0, 0.0)
         p = first_partial[row] * stride + M_RED
         for j in range(3):
             if learns(records[row * RECORD_C + RED + j]):
@@ -118,8 +137,8 @@ def harmonics_adjoint(
         if has_pose != 0:
             for j in range(3):
                 v_pose[row * POSE_C + 12 + j] = v_center[j]
-    for k in range(16):
-        if k < stored_bases:
-            for j in range(3):
-                put(buffer, 3 * k + j, basis[k] * v_color[j])
-    store_rows(v_sh, buffer, row, count, 3 * stored_bases)
+        for k in range(16):
+            if k < stored_bases:
+                for j in range(3):
+                    put(buffer, 3 * k + j, basis[k] * v_color[j])
+    store_rows(v_sh, buffer, row, count, 3 * stored_bases, visible)
