@@ -28,7 +28,7 @@ from hoigs.preparation.objects.ball import (
 from hoigs.preparation.objects.explained import colors_of, held_back_error, silhouette_ious
 from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.plate import plate_object
-from hoigs.preparation.objects.rod import rod_object
+from hoigs.preparation.objects.rod import breadth_of, rod_object
 from hoigs.preparation.objects.shape import held_object, sphere_points
 from hoigs.preparation.objects.tracked import ObjectConfidence, tracked_object
 from hoigs.preparation.objects.watched import UntrackableError, watched
@@ -101,6 +101,7 @@ def _on_object(
 
 
 FOOTBALL = 0.11  # metres
+THREAD = 6.0  # pixels: what is no broader shows no texture
 BETTER = 0.9  # of the error of poses by texture: what the outlines' must be below to be taken
 
 
@@ -242,13 +243,15 @@ def make_object(
         except NoBallError as reason:
             if way == "ball":
                 reasons.append(f"it cannot be posed as a ball: {reason}")
-    turning, failed = _turning(filmed, way, count, progress)
-    reasons += failed
+    turning: list[_Turning] = []
     if way in ("auto", "rod"):
         try:
-            turning.insert(0, _Turning(*rod_object(filmed, count)))
+            turning.append(_Turning(*rod_object(filmed, count)))
         except UntrackableError as reason:
             reasons.append(f"it cannot be posed as a rod: {reason}")
+    if not (turning and breadth_of(masks) <= THREAD):
+        others, failed = _turning(filmed, way, count, progress)
+        turning, reasons = turning + others, reasons + failed
     if turning and way != "auto":
         return _made(filmed, turning[0])
     track, normals, spread = held_object(filmed, count)

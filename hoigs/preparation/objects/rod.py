@@ -151,6 +151,12 @@ def rod_object(
     return track, normals, guessed / float(away), confidence
 
 
+def breadth_of(masks: MaskStack) -> float:
+    """Pixels across something long and thin, the median of the frames that show it."""
+    axes = [(_Axis.of(mask), mask.sum()) for mask in masks if mask.sum() > 1]
+    return float(np.median([area / (axis.high - axis.low) for axis, area in axes]))
+
+
 def _sights(
     rows: np.ndarray, axes: Sequence[_Axis], cameras: Sequence[Camera], hands: HandMotion
 ) -> _Sights:
