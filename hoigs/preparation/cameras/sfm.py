@@ -142,10 +142,13 @@ def _match(pycolmap: Any, features: Path, matches: Path, focal: float | None) ->
             camera.focal_length = focal
             database.update_camera(camera)
     database.close()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0  # else each run has other matches, and other cameras
     pycolmap.match_sequential(
         half,
         matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=_threads()),
         pairing_options=pycolmap.SequentialPairingOptions(overlap=OVERLAP, quadratic_overlap=True),
+        verification_options=verification,
         device=pycolmap.Device.cpu,
     )
     half.replace(matches)
