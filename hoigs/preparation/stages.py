@@ -402,7 +402,8 @@ def place_objects(
         if len(draft.bodies) > 1:
             provenance[f"hands at {name}"] = f"{owner}'s, who is nearest to it in most frames"
         windows = options.chunk is not None and options.chunk < len(cameras)
-        said = doubts(stack, None if person is None else person.image, humans)
+        rod = made.confidence.way == "rod"
+        said = doubts(stack, None if person is None else person.image, humans, rod)
         said += _remarks(made, disc is not None, windows)
         unknown = {}
         if made.confidence.way != "texture and hands":

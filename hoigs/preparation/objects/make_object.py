@@ -44,7 +44,10 @@ VISIBLE = 0.5  # landmarks that are surer than this
 
 
 def doubts(
-    masks: MaskStack, landmarks: Float[Tensor, "F 33 3"] | None, humans: MaskStack | None = None
+    masks: MaskStack,
+    landmarks: Float[Tensor, "F 33 3"] | None,
+    humans: MaskStack | None = None,
+    rod: bool = False,
 ) -> list[str]:
     """Sentences for the report: the border cuts the object often, its mask has several large
     parts, or most of the person's landmarks lie on it, and little of the person is beside it.
@@ -52,6 +55,7 @@ def doubts(
     Args:
         landmarks: x, y in pixels and visibility, NaN where unknown; None: of nobody.
         humans: of people, without the object; None: not known.
+        rod: the object is one, whose parts a hand and what is before it divide.
     """
     outlines = outlines_of(masks)
     seen = np.flatnonzero(outlines.observed)
@@ -63,7 +67,7 @@ def doubts(
             "it: its shape and distance are known less well there"
         )
     parted = float(np.mean([_parted(masks[i]) for i in seen.tolist()]))
-    if parted > OFTEN:
+    if parted > OFTEN and not rod:
         found.append(
             f"the object's mask has two large parts in {100 * parted:.0f} % of the frames: if they "
             "are two objects, both are tracked as one; point at one of them (--object X,Y)"

@@ -57,6 +57,10 @@ def test_doubts(corners: list[tuple[int, int]], x: float, said: str) -> None:
     assert said in found
 
 
+def test_a_rod_has_two_parts_beside_the_hand() -> None:
+    assert doubts(boxes((10, 20), (50, 20)), marks(70), rod=True) == []
+
+
 def test_iou_of_a_ball_and_its_mask() -> None:
     K = torch.tensor([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])
     camera = Camera(K, torch.eye(4), WIDTH, HEIGHT)
