@@ -195,6 +195,9 @@ def say(text: str) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+SILENCE = 20.0  # seconds between lines where no terminal shows a bar
+
+
 class Display:
     """Callbacks of the public functions, as methods; leaving the context ends the bar."""
 
@@ -203,6 +206,7 @@ class Display:
         self._bar: Progress | None = None
         self._steps = 0
         self._began, self._last = time.perf_counter(), ""
+        self._said = 0.0  # seconds after which the last line went to stderr
         self._psnr: dict[str, float] = {}
 
     def __enter__(self) -> Display:
@@ -251,11 +255,17 @@ class Display:
             )
 
     def fraction(self, done: float, text: str) -> None:
-        """`progress`: a bar over a job that reports fractions; with -v also a line a step."""
+        """`progress`: a bar over a job that reports fractions; with -v also a line a step, and
+        where no terminal shows the bar, now and then a line on stderr."""
+        seconds = time.perf_counter() - self._began
+        line = f"{seconds:7.1f} s  {100 * done:3.0f} %  {printable(text)}"
+        shown = Talk.quiet or Talk.verbose or sys.stderr.isatty()
         if Talk.verbose and text != self._last:
             self._last = text
-            seconds = time.perf_counter() - self._began
-            say(f"{seconds:7.1f} s  {100 * done:3.0f} %  {printable(text)}")
+            say(line)
+        elif not shown and seconds - self._said >= SILENCE:
+            self._said = seconds
+            typer.echo(line, err=True)
         if self._bar is None:
             self._bar = self._bars.enter_context(progress_bar("working", 1.0))
         self._bar(done, text)

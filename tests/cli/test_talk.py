@@ -69,6 +69,18 @@ def test_verbose_has_a_line_for_each_step(capsys, talk):
     assert [line.split()[-1] for line in lines] == ["masks", "body"] and "50 %" in lines[1]
 
 
+def test_without_a_terminal_a_long_work_says_where_it_is(capsys, talk, monkeypatch):
+    talk()
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    with Display() as show:
+        for seconds, done, text in ((1, 0.1, "masks"), (25, 0.3, "body"), (30, 0.4, "body")):
+            now[0] = seconds
+            show.fraction(done, text)
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.split() == ["25.0", "s", "30", "%", "body"]
+
+
 def test_both_may_stand_behind_the_command(hoigs, tmp_path):
     failed = hoigs("eval", str(tmp_path / "none"))
     assert failed.code == 2 and "Traceback" not in failed.err
