@@ -49,6 +49,10 @@ class Line:
         beyond = np.maximum(-along, along - self.length).clip(0)
         return float(np.hypot(beyond, aside).mean())
 
+    def point(self, share: float) -> Float[np.ndarray, "2"]:
+        """x, y at a share of its length."""
+        return self.start + share * self.length * self.direction
+
     def points(self) -> Float[np.ndarray, "S 2"]:
         """x, y along it."""
         return self.start + np.arange(0.0, self.length + STEP / 2, STEP)[:, None] * self.direction

@@ -31,8 +31,8 @@ BETTER = 1.05  # times the evidence that a wider look must find
 FEWEST, OFTEN = 4, 0.25  # frames, and share of them, that show what nobody clicked
 MIDDLE = 0.6  # of a line's length: where it is clicked then
 SHORTEST, SLENDER = 0.6, 0.08  # torsos of its length; of that, half of its breadth
-SUPPORTED, CRISP = 0.75, 0.3  # share of the clicked line's pixels that differ from both sides and
-# are before no body; and how much, on average
+SUPPORTED = 0.75  # share of the clicked line's pixels that differ from both sides, before no body
+CRISP = 0.3  # and evidence for each, on average
 WEAKER = 0.35  # of the clicked line's evidence for each pixel
 FORESHORTENED, LONGER = 0.25, 1.3  # of the clicked line's length
 CLEAR = 1.6  # times the evidence of any line that is no neighbour
@@ -64,9 +64,14 @@ class Rod:
     differs: float = 0.0
 
     @property
+    def lines(self) -> tuple[Line, ...]:
+        """On the clicked side of the hand, and perhaps on the other."""
+        return (self.line,) if self.other is None else (self.line, self.other)
+
+    @property
     def click(self) -> Float[np.ndarray, "2"]:
         """A point x, y on it, away from the hand."""
-        return self.line.start + MIDDLE * self.line.length * self.line.direction
+        return self.line.point(MIDDLE)
 
 
 def rod_of(
@@ -170,8 +175,7 @@ def _clearest(
     opposite = np.cos(angles - angles[a]) < -np.cos(2 * ASIDE)  # may be the rest of it
     if not each[a] > CLEAR * max(float(each[apart & ~opposite].max()), 0.0):
         return None
-    line = fan.only(fan.angles == angles[a]).best(look)
-    return line.start + MIDDLE * line.length * line.direction
+    return fan.only(fan.angles == angles[a]).best(look).point(MIDDLE)
 
 
 def _across(hand: Float[np.ndarray, "2"], line: Line, bend: float, torso: float) -> Fan:
@@ -184,8 +188,7 @@ def clicked_rod(
     footage: Footage, scene: Scene, people: Sequence[Float[np.ndarray, "F 33 4"]], rod: Rod
 ) -> PromptedMask:
     """Its mask in the clicked frame."""
-    lines = (rod.line, rod.other) if rod.other else (rod.line,)
-    masks = [pixels_of(footage, scene, people, rod.frame, rod, line) for line in lines]
+    masks = [pixels_of(footage, scene, people, rod.frame, rod, line) for line in rod.lines]
     soft = np.any(masks, axis=0).astype(np.float32)
     return PromptedMask(rod.frame, soft, 1.0, False, footage.blank[rod.frame])
 
@@ -218,8 +221,8 @@ def _half_breadth(look: Look, line: Line) -> float:
 # The line of each frame, and its pixels.
 
 PEAKS = 5  # lines of a frame that are compared
-ABSENT, TURNS, DOUBT = 0.25, 0.5, 1.0  # costs of a frame without it, of turning by FASTEST, and of
-# a line which others come near to
+ABSENT, TURNS = 0.25, 0.5  # costs of a frame without it, and of turning by FASTEST
+DOUBT = 1.0  # cost of a line which others come near to
 
 
 @dataclass(frozen=True)
@@ -249,7 +252,7 @@ def rod_followed(
     for i in range(len(footage)):
         rod = given[min(given, key=lambda frame: abs(frame - i))]
         if i in given:
-            found.append([_Found((rod.line, rod.other) if rod.other else (rod.line,), 1.0, True)])
+            found.append([_Found(rod.lines, 1.0, True)])
         else:
             found.append(_found_in(footage, scene, people, rod, i))
         progress((i + 1) / len(footage))
@@ -369,7 +372,7 @@ def pixels_of(
     changed = (away > max(CHANGED, SHARE * rod.differs)) & ~look.body
     core &= changed | look.body
     near = on & (aside <= rod.beside + BLURRED * along.clip(0)) & changed
-    end = line.start + line.length * line.direction
+    end = line.point(1.0)
     tip = (np.hypot(x - end[0], y - end[1]) < TIP * rod.line.length) & changed
     labels, _ = ndimage.label(core | near | tip, np.ones((3, 3)))
     kept = np.isin(labels, np.unique(labels[core]))
