@@ -16,7 +16,7 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.scene import Scene
 
 DIFFERS, STANDS_OUT = 6.0, 20.0  # units of noise and of colour that are full evidence
-HALF = 15.0  # units of colour off the thing's own at which a pixel before a body counts little
+HALF = 25.0  # units of colour off the thing's own at which a pixel before a body counts little
 LEAST = 0.2  # evidence of a pixel from which it lengthens a line
 STEP = 1.5  # pixels along a line
 BLURRED = 0.04  # pixels by which sides are farther off for each pixel along: a swing blurs the end
