@@ -32,6 +32,7 @@ BARE = (
     (24, 26), (26, 28), (7, 8),
 )  # fmt: skip
 THIN = 0.07  # radius of these, in torsos
+TALLER = 1.4  # breadths of the shoulders that a torso is long
 SAMPLED = 12  # frames in which the body's colours are learnt
 
 
@@ -72,6 +73,18 @@ def torso_length(landmarks: Float[np.ndarray, "F 33 4"]) -> Float[np.ndarray, "F
         return length
     usual = np.nanquantile(length, 0.75)
     return np.fmax(length, 0.8 * usual)
+
+
+def usual_torso(people: Sequence[Float[np.ndarray, "F 33 4"]]) -> float:
+    """The usual length of a torso in pixels, by the breadth of the shoulders where no hips are ever
+    seen, as of somebody at a table; NaN where nobody's shoulders are."""
+    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
+    if np.isfinite(lengths).any():
+        return float(np.nanmedian(lengths))
+    seen = [p[(p[:, SHOULDERS, 3] > SEEN).all(1)] for p in people]
+    broad = [np.linalg.norm(p[:, 11, :2] - p[:, 12, :2], axis=-1) for p in seen]
+    every = np.concatenate(broad) if broad else np.zeros(0)
+    return TALLER * float(np.quantile(every, 0.75)) if len(every) else float("nan")
 
 
 def limbs(
@@ -186,10 +199,9 @@ def body_colors(
 ) -> Float[np.ndarray, "B"] | None:
     """Colours along the limbs in most of some frames, as a thing that is held covers them now and
     then; None where no torso is seen."""
-    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
-    if not np.isfinite(lengths).any():
+    torso, found = usual_torso(people), []
+    if not np.isfinite(torso):
         return None
-    torso, found = float(np.nanmedian(lengths)), []
     for i in np.unique(np.linspace(0, len(footage) - 1, SAMPLED).astype(int)).tolist():
         bare = bare_limbs(footage.shape, [p[i] for p in people], torso) & footage.person[i]
         found += [histogram(bins_of(footage.colors(i)), bare * 1.0)] if bare.any() else []

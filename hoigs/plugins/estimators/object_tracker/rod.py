@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.footage import Footage, torso_length
+from hoigs.plugins.estimators.object_tracker.footage import Footage, usual_torso
 from hoigs.plugins.estimators.object_tracker.lines import BLURRED, LEAST, STEP, Fan, Line, Look
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.propagation import Track
@@ -87,8 +87,8 @@ def rod_of(
     Args:
         click: x, y in pixels of the footage.
     """
-    torso = _torso(people)
-    if torso is None:
+    torso = usual_torso(people)
+    if not np.isfinite(torso):
         return None
     best: Rod | None = None
     look = Look.at(footage, scene, frame)
@@ -122,12 +122,6 @@ def rod_of(
     )
 
 
-def _torso(people: Sequence[Float[np.ndarray, "F 33 4"]]) -> float | None:
-    """The usual length of a torso in pixels; None where none is seen."""
-    lengths = np.concatenate([torso_length(p) for p in people] or [np.array([np.nan])])
-    return float(np.nanmedian(lengths)) if np.isfinite(lengths).any() else None
-
-
 def _hand(landmarks: Float[np.ndarray, "33 4"], hand: int) -> Float[np.ndarray, "2"]:
     """The middle x, y of a hand."""
     return landmarks[list(HANDS[hand]), :2].mean(0)
@@ -141,8 +135,8 @@ def rods_held(
 ) -> list[Rod]:
     """A thing that nobody clicked, where one hand holds one in many of some frames: as these show
     it, the clearest first."""
-    torso = _torso(people)
-    if torso is None:
+    torso = usual_torso(people)
+    if not np.isfinite(torso):
         return []
     found: dict[tuple[int, int], list[Rod]] = {}
     first = frames[::GLANCE]

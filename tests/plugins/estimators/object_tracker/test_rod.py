@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from disc_world import H, W, masks_of, request, texture
 from test_behind import footage_of
 
@@ -16,6 +17,7 @@ from hoigs.core.interfaces.estimator import (
     PromptPoint,
     VideoRequest,
 )
+from hoigs.plugins.estimators.object_tracker.footage import body_colors, usual_torso
 from hoigs.plugins.estimators.object_tracker.prompts import overlap
 from hoigs.plugins.estimators.object_tracker.rod import (
     Rod,
@@ -116,6 +118,19 @@ def test_a_frame_without_it_has_no_mask() -> None:
     frames, people, _ = scene(lambda i: [swing(i)] if i < 12 else [])
     found, _ = followed(frames, people, swing(CLICKED))
     assert not found[12:].any()
+
+
+def test_somebody_at_a_table_whose_hips_nobody_sees_holds_one_too() -> None:
+    frames, people, _ = scene(lambda i: [swing(i)])
+    footage, marks = footage_of(frames, people), landmarks()
+    marks[:, [11, 12], 0] = 40, 24
+    marks[:, [23, 24], 3] = 0
+    assert usual_torso([marks]) == pytest.approx(1.4 * 16)
+    rod = rod_of(footage, static_scene(footage), [marks], CLICKED, np.array(middle(swing(CLICKED))))
+    assert rod is not None and abs(rod.line.length - LENGTH) < 4
+    assert body_colors(footage, [marks]) is not None
+    marks[:, [11, 12], 3] = 0
+    assert np.isnan(usual_torso([marks])) and body_colors(footage, [marks]) is None
 
 
 def test_a_disc_and_a_limb_are_no_rods() -> None:
