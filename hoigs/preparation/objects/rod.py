@@ -259,10 +259,9 @@ def _carried(directions: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 3 3"]
     for direction in directions:
         axis = np.cross(last[:, 0], direction)
         size = float(np.linalg.norm(axis))
-        if size < 1e-9 and last[:, 0] @ direction < 0:
-            axis, size = last[:, 1], 1.0  # half a turn, about any axis across it
         angle = np.arctan2(size, last[:, 0] @ direction)
-        turn = axis_angle_to_matrices(torch.from_numpy(axis / max(size, 1e-9) * angle))
+        unit = axis / size if size > 1e-9 else last[:, 1]  # half a turn is about any axis across
+        turn = axis_angle_to_matrices(torch.from_numpy(unit * angle))
         last = turn.numpy() @ last
         found.append(last)
     return np.stack(found)

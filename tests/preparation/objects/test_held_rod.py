@@ -13,7 +13,7 @@ from hoigs.preparation.mask_stack import MaskStack
 from hoigs.preparation.objects.filmed import Filmed
 from hoigs.preparation.objects.hands import INDEX, LITTLE, MIDDLE
 from hoigs.preparation.objects.make_object import make_object
-from hoigs.preparation.objects.rod import rod_object
+from hoigs.preparation.objects.rod import _carried, rod_object
 from hoigs.preparation.objects.watched import UntrackableError
 
 FRAMES, WIDTH, HEIGHT, LENGTH, RADIUS = 30, 320, 240, 0.8, 0.012
@@ -98,6 +98,16 @@ def test_what_is_broad_or_in_no_hand_is_no_rod() -> None:
     shown.joints[...] = torch.tensor([1.5, 1.0, 2.0])
     with pytest.raises(UntrackableError, match="no hand is on its axis"):
         rod_object(shown, 100)
+
+
+def test_directions_are_carried_without_a_turn_about_them() -> None:
+    x, y = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
+    found = _carried(np.stack((x, x, y, -y, x)))  # the fourth is half a turn away
+    np.testing.assert_allclose(found[:, :, 0], np.stack((x, x, y, -y, x)), atol=1e-6)
+    np.testing.assert_allclose(
+        found @ found.transpose(0, 2, 1), np.tile(np.eye(3), (5, 1, 1)), atol=1e-6
+    )
+    np.testing.assert_allclose(np.linalg.det(found), 1.0, atol=1e-6)
 
 
 def test_a_rod_is_taken_for_one() -> None:
