@@ -50,7 +50,10 @@ def prepare(
             help="A video, or a folder with a video or frames and further inputs; or a URL of one."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Clip folder to make.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Clip folder to make; default: clips/VIDEO'S NAME."),
+    ] = None,
     stage: Annotated[
         str | None, typer.Option("--stage", help="Stop after this stage; no clip is written.")
     ] = None,
@@ -60,7 +63,9 @@ def prepare(
     """Turn a video into a clip: a folder with cameras, masks, body, objects, and a report."""
     from hoigs.preparation.prepare import prepare as run
     from hoigs.preparation.prepare import prepare_until, work_folder
+    from hoigs.preparation.video.source import clip_named_after
 
+    out = clip_named_after(source) if out is None else out
     if stage is not None:
         with Display() as show:
             seconds = prepare_until(

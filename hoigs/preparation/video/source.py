@@ -11,7 +11,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.core.interfaces.estimator import EstimateKind
 from hoigs.core.spec.schema import ComponentSpec
 from hoigs.core.system.colmap_files import PARTS, models_in
-from hoigs.core.system.files import NotRegularError, did_you_mean_beside, regular_file
+from hoigs.core.system.files import NotRegularError, did_you_mean_beside, name_from, regular_file
 from hoigs.core.system.npz import holds
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -65,6 +65,11 @@ class Source:
     cameras: Path | None = None
     ball: Path | None = None
     absent: frozenset[str] = frozenset()
+
+
+def clip_named_after(source: Path) -> Path:
+    """Where the clip of a video, or of a folder with one, goes if nobody says: clips/ITS NAME."""
+    return Path("clips") / name_from(source.name if source.is_dir() else source.stem, "mine")
 
 
 def find_source(

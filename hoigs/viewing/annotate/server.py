@@ -22,10 +22,10 @@ from urllib.parse import unquote, urlsplit
 from pydantic import ValidationError
 
 from hoigs.core.errors import HoigsError
-from hoigs.core.system.files import json_value, name_from
+from hoigs.core.system.files import json_value
 from hoigs.core.system.video_files import pyav
 from hoigs.preparation.options import PrepareOptions
-from hoigs.preparation.video.source import find_source
+from hoigs.preparation.video.source import clip_named_after, find_source
 from hoigs.viewing.annotate.session import Session
 
 LOCAL = "127.0.0.1"
@@ -230,7 +230,7 @@ def annotate(
 
     Args:
         video: a video, or a folder with one or with frames.
-        out: the clip that the page proposes; None: clips/ and the video's name.
+        out: the clip that the page proposes; None: clips/ and the video's or folder's name.
         port: 0 finds a free one.
         options: of the preparations that the page starts, as for `prepare`.
         open_browser: open the page in the user's browser.
@@ -244,7 +244,7 @@ def annotate(
     pyav()
     chosen = PrepareOptions.of(options, verb="annotate")
     found = find_source(Path(video), complete=False).video
-    given = Path("clips") / name_from(found.stem, "mine") if out is None else Path(out)
+    given = clip_named_after(Path(video)) if out is None else Path(out)
     session = Session(found, given, chosen)
     try:
         with PageServer(session, port) as server:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hoigs.core.system.colmap_files import choice_told
-from hoigs.preparation.video.source import SourceError, find_source
+from hoigs.preparation.video.source import SourceError, clip_named_after, find_source
 
 
 def test_finds_everything(tiny_source: Path) -> None:
@@ -87,3 +87,11 @@ def test_the_largest_colmap_model_is_taken(tiny_source: Path) -> None:
     assert find_source(tiny_source).colmap == tiny_source / "sparse/1"
     told = choice_told(tiny_source / "sparse", tiny_source / "sparse/1")
     assert told is not None and "sparse/0 (3 images)" in told and "sparse/1 (5 images)" in told
+
+
+def test_a_clip_is_named_after_its_video(tmp_path: Path) -> None:
+    (tmp_path / "on the beach").mkdir()
+    assert clip_named_after(tmp_path / "on the beach") == Path("clips/on-the-beach")
+    assert clip_named_after(tmp_path / "Me & you.mp4") == Path("clips/Me-you")
+    assert clip_named_after(Path("https://host/dance.mp4")) == Path("clips/dance")
+    assert clip_named_after(Path(".")) == Path("clips/mine")
