@@ -68,7 +68,7 @@ PLAN = {
         3,
         ("frames", "estimates"),
         ("camera", "focal", "intrinsics", "calibration", "keep_borders"),
-        version=6,
+        version=7,
     ),
     "people": Stage(
         46,

@@ -249,7 +249,7 @@ def _from_motion(
 ) -> ChosenCameras:
     focal = options.focal and options.focal * video.width / video.native_width
     try:
-        model = structure_from_motion(
+        found = structure_from_motion(
             video, masks, folder / "sfm", focal=focal, lens=None if lens is None else lens[0],
             progress=progress,
         )  # fmt: skip
@@ -261,11 +261,22 @@ def _from_motion(
             f"{_turns(motion)}, and turns alone leave {motion.parallax:.1f} px of it: --camera "
             f"turning has that error, and is nearer than --camera static. {error}"
         ) from error
-    track = colmap_cameras(video, model, partial=True)
+    track = colmap_cameras(video, found.model, partial=True)
+    figures, warnings = dict(track.figures), list[str]()
+    if found.focals is not None:
+        low, high = (round(f * video.native_width / video.width, 1) for f in found.focals)
+        figures |= {"focal_low_px": low, "focal_high_px": high}
+        if not found.confirmed:
+            warnings.append(
+                "structure from motion led to this focal length from one start alone: "
+                f"{low:.0f} to {high:.0f} px are usual or found, and cameras and depths follow it: "
+                "give --focal or --calibration if you know the lens"
+            )
     track = replace(
-        track, provenance=f"structure from motion without the masked pixels: {track.provenance}"
+        track,
+        provenance=f"structure from motion without the masked pixels: {track.provenance}",
+        figures=figures,
     )
-    warnings = []
     lost = len(video) - len(track.positions)
     if lost:
         warnings.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from PIL import Image
 from hoigs.core.reporting import ranges
 from hoigs.core.values.lens import Lens
 from hoigs.preparation.cameras.camera_track import ASSUMED_FOCAL
+from hoigs.preparation.cameras.focal import USUAL
 from hoigs.preparation.cameras.turning_cameras import grown, quiet_colmap
 from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.video.frames import Frames
@@ -26,6 +28,26 @@ WIDEST = 0.33  # focal length, in longer sides: a view of 113 degrees
 FURTHER = (1.15, 1.6, 0.55)  # focal lengths, in longer sides, after ASSUMED_FOCAL
 SMALLEST_SHARE = 0.5  # of the frames: with fewer cameras there is no clip
 SHORTEST = 0.5  # seconds of a part of the video that is worth a clip
+SAME = 1.05  # ratio of the focal lengths of two starts up to which the one confirms the other
+FEWEST = 10  # cameras of a half of the video that is adjusted by itself
+ITERATIONS = 40
+
+
+@dataclass(frozen=True)
+class FromMotion:
+    """A COLMAP model, and how well the video determines its focal length.
+
+    Attributes:
+        model: its folder; its images are named by frame number.
+        focals: shortest and longest focal length, in pixels of the frames, that two starts and the
+            halves of the video give, with the usual ones if it is not confirmed; None where there
+            is but one, or the lens is calibrated.
+        confirmed: another start led to the same focal length, or it was given.
+    """
+
+    model: Path
+    focals: tuple[float, float] | None
+    confirmed: bool
 
 
 def structure_from_motion(
@@ -36,11 +58,13 @@ def structure_from_motion(
     focal: float | None = None,
     lens: Lens | None = None,
     progress: Callable[[float], None] | None = None,
-) -> Path:
+) -> FromMotion:
     """A COLMAP model of the chosen frames, the largest that was found.
 
     COLMAP verifies pairs of images with the focal length at the start, and a bad guess leaves no
-    pair; so several are tried until half of the frames have a camera.
+    pair; so several are tried until half of the frames have a camera. A camera that turns more than
+    it travels is explained by several focal lengths, each with cameras of its own: what was found
+    is sought once more from the start that is farthest from it.
 
     Features on masked pixels are left out; frames are matched with their neighbours in time; one
     camera with one radial distortion serves all (COLMAP, Schoenberger and Frahm 2016).
@@ -51,9 +75,6 @@ def structure_from_motion(
         focal: pixels of the frames' size, if known; it is still refined.
         lens: of the video, if calibrated; it is not refined.
         progress: called with 0..1.
-
-    Returns:
-        folder of the model; its images are named by frame number.
 
     Raises:
         SourceError: less than half of the frames were given a camera, and why that may be.
@@ -69,39 +90,59 @@ def structure_from_motion(
     if lens is not None:
         lens = lens.resized(video.width, video.height)
         focal = float(lens.K[0, 0])
-    tried = (focal,) if focal else tuple(share * longer for share in (ASSUMED_FOCAL, *FURTHER))
-    best, count = None, 0
+    tried = [focal] if focal else [share * longer for share in (ASSUMED_FOCAL, *FURTHER)]
+    enough, found = SMALLEST_SHARE * len(video), list[Any]()
     with quiet_colmap():
         if not features.is_file():
             _extract(pycolmap, features, images, _reader(pycolmap, video, folder, tried[0], lens))
-        for number, length in enumerate(tried):
-            begun = 0.4 + 0.6 * number / len(tried)
+
+        def started(number: int) -> Any:
+            """The model from one of the focal lengths, or None."""
+            begun = 0.4 + 0.6 * number / (len(tried) + 1)
             report(begun)
             matches = folder / f"matches-{number}.db"
             if not matches.is_file():
-                _match(pycolmap, features, matches, None if lens else length)
-            report(begun + 0.3 / len(tried))
-            found = _mapped(pycolmap, matches, images, folder / "models" / str(number), lens)
-            if found is not None and found.num_reg_images() > count:
-                best, count = found, found.num_reg_images()
-            if count >= SMALLEST_SHARE * len(video):
+                _match(pycolmap, features, matches, None if lens else tried[number])
+            report(begun + 0.3 / (len(tried) + 1))
+            return _mapped(pycolmap, matches, images, folder / "models" / str(number), lens)
+
+        for number in range(len(tried)):
+            model = started(number)
+            found += [] if model is None else [model]
+            if model is not None and model.num_reg_images() >= enough:
                 break
-    if best is None or count < SMALLEST_SHARE * len(video):
-        lengths = ", ".join(f"{length:.0f}" for length in tried)
-        raise SourceError(
-            f"structure from motion gave cameras to {count} of {len(video)} frames, with focal "
-            f"lengths of {lengths} px to start from. {_what_to_do(best, video)}if the camera "
-            "stands still, use --camera static, and if it hardly changes its place, as in a hand, "
-            "--camera turning; if you know the lens, give --focal or "
-            "--calibration; else the background may lack texture, be blurred or be hidden by the "
-            "masks: look at the masks, take sharper or more frames, or put a COLMAP model of your "
-            "own beside the video, as sparse/"
-        )
+        best = max(found, key=lambda m: m.num_reg_images(), default=None)
+        if best is None or best.num_reg_images() < enough:
+            raise SourceError(_too_few(best, video, tried))
+        models, known = [best], lens is not None or focal is not None
+        if not known:
+            far = max(range(len(tried)), key=lambda n: _ratio(tried[n], _focal(best)))
+            again = started(far)
+            models += [again] if again and again.num_reg_images() >= enough else []
+        confirmed = known or (len(models) > 1 and _ratio(*map(_focal, models)) <= SAME)
+        if not confirmed:
+            best = max(models, key=lambda m: (m.num_reg_images(), m.compute_num_observations()))
+        usual = None if confirmed else (USUAL[0] * longer, USUAL[1] * longer)
+        focals = None if lens else _focals(pycolmap, best, models, usual)
     kept = folder / "largest"
     kept.mkdir()
     best.write(kept)
     report(1.0)
-    return kept
+    return FromMotion(kept, focals, confirmed)
+
+
+def _too_few(best: Any, video: Frames, tried: list[float]) -> str:
+    lengths = ", ".join(f"{length:.0f}" for length in tried)
+    count = 0 if best is None else best.num_reg_images()
+    return (
+        f"structure from motion gave cameras to {count} of {len(video)} frames, with focal "
+        f"lengths of {lengths} px to start from. {_what_to_do(best, video)}if the camera "
+        "stands still, use --camera static, and if it hardly changes its place, as in a hand, "
+        "--camera turning; if you know the lens, give --focal or "
+        "--calibration; else the background may lack texture, be blurred or be hidden by the "
+        "masks: look at the masks, take sharper or more frames, or put a COLMAP model of your "
+        "own beside the video, as sparse/"
+    )
 
 
 def _write_images(
@@ -161,6 +202,43 @@ def _mapped(pycolmap: Any, matches: Path, images: Path, folder: Path, lens: Lens
         _copy(matches), images, folder, options=_mapping(pycolmap, lens is not None)
     )
     return max(models.values(), key=lambda m: m.num_reg_images(), default=None)
+
+
+def _focal(model: Any) -> float:
+    """Focal length of a model's one camera, pixels."""
+    return float(next(iter(model.cameras.values())).params[0])
+
+
+def _ratio(a: float, b: float) -> float:
+    return max(a, b) / min(a, b)
+
+
+def _focals(
+    pycolmap: Any, best: Any, models: list[Any], usual: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    """Shortest and longest focal length: of all models, of the halves of the best one's frames,
+    each adjusted by itself, and of what is `usual`."""
+    lengths = [*map(_focal, models), *(usual or ())]
+    rows = sorted(
+        (i for i, m in best.images.items() if m.has_pose), key=lambda i: best.image(i).name
+    )
+    half = len(rows) // 2
+    if half >= FEWEST:
+        lengths += [_adjusted_focal(pycolmap, best, part) for part in (rows[:half], rows[half:])]
+    return (min(lengths), max(lengths)) if len(lengths) > 1 else None
+
+
+def _adjusted_focal(pycolmap: Any, model: Any, rows: list[int]) -> float:
+    """The focal length after a bundle adjustment of some images alone."""
+    copy = pycolmap.Reconstruction(model)
+    for image in copy.images.values():
+        if image.has_pose and image.image_id not in rows:
+            copy.deregister_frame(image.frame_id)
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    options.ceres.solver_options.max_num_iterations = ITERATIONS
+    options.ceres.solver_options.num_threads = _threads()
+    pycolmap.bundle_adjustment(copy, options)
+    return _focal(copy)
 
 
 def _what_to_do(model: Any, video: Frames) -> str:

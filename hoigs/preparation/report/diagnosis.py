@@ -60,16 +60,7 @@ def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
             "camera only. An estimator of depth (--set estimators.depth.use=…) gives it one; "
             "--camera moving declares that the camera does move.",
         )
-        if report.focal_px is not None and report.focal_range is not None:
-            low, high = report.focal_range
-            yield _judged(
-                "focal length",
-                f"{report.focal_px:.0f} px",
-                f"{low * report.focal_px:.0f} to {high * report.focal_px:.0f} px are possible, and "
-                "all depths scale with it",
-                _judge(max(high - 1, 1 - low), 0.05, 0.25),
-                "give --focal, --intrinsics or --calibration if you know the lens",
-            )
+        yield from _focal_length(report, "all depths scale with it")
         return
     if report.registered is not None:
         yield _judged(
@@ -89,6 +80,7 @@ def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
             "cameras are off by about as much: let training refine them (train.rates.camera), or "
             "look for movement outside the masks",
         )
+    yield from _focal_length(report, "cameras and depths follow it")
     yield _judged(
         "parallax",
         f"{report.parallax_degrees:.1f}°",
@@ -96,6 +88,20 @@ def _cameras(report: Measures) -> Iterator[MeasureDiagnostic]:
         _judge(-report.parallax_degrees, -10, -5),
         "the scene's depth is weakly known: walk around the person next time, or add an "
         "estimator of depth",
+    )
+
+
+def _focal_length(report: Measures, meaning: str) -> Iterator[MeasureDiagnostic]:
+    if report.focal_px is None or report.focal_range is None:
+        return
+    low, high = report.focal_range
+    yield _judged(
+        "focal length",
+        f"{report.focal_px:.0f} px",
+        f"{low * report.focal_px:.0f} to {high * report.focal_px:.0f} px are possible, and "
+        f"{meaning}",
+        _judge(max(high - 1, 1 - low), 0.05, 0.25),
+        "give --focal, --intrinsics or --calibration if you know the lens",
     )
 
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from hoigs.preparation.body.landmarks import Landmarks
 from hoigs.preparation.cameras.choose import BesideVideo, ChosenCameras, choose_cameras
-from hoigs.preparation.cameras.sfm import _what_to_do, structure_from_motion
+from hoigs.preparation.cameras.sfm import _focals, _what_to_do, structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import background_motion
 from hoigs.preparation.estimates.reader import GivenMasks
 from hoigs.preparation.mask_stack import MaskStack
@@ -251,8 +251,8 @@ def test_features_and_matches_survive_a_kill(
     done.clear()
     counted("extract_features")
     counted("match_sequential")
-    resumed = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL))
-    again = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL))
+    resumed = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL).model)
+    again = pycolmap.Reconstruction(structure_from_motion(video, masks, work, focal=FOCAL).model)
     assert done == ["match_sequential"], "features were kept, and then the matches, too"
     for image in resumed.images.values():
         twin = again.images[image.image_id]
@@ -276,3 +276,28 @@ def test_matches_are_drawn_by_a_fixed_seed(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(pycolmap, "match_sequential", matched)
     structure_from_motion(video, masks, tmp_path / "work", focal=FOCAL)
     assert len(seeds) == 1 and seeds[0] >= 0
+
+
+def test_a_focal_length_that_the_video_does_not_determine(tmp_path: Path) -> None:
+    """Walls that face a camera which walks sideways look the same through every lens: what is
+    twice as far away through twice the lens."""
+    video, masks = recorded(tmp_path / "moves", [0.1 * i for i in range(COUNT)])
+    chosen = cameras_of(video, masks, tmp_path, camera="moving")
+    low, high = (chosen.track.figures[f"focal_{end}_px"] for end in ("low", "high"))
+    assert low < FOCAL < high and high > 1.3 * low
+    assert any("one start alone" in text for text in chosen.warnings)
+
+
+def test_how_far_a_focal_length_is_known() -> None:
+    """The halves of the frames, each by itself, lie to both sides of what all give."""
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=24, num_points3D=150,
+        camera_model_id=pycolmap.CameraModelId.SIMPLE_RADIAL,
+        camera_params=[FOCAL, WIDTH / 2, HEIGHT / 2, 0.0], camera_width=WIDTH, camera_height=HEIGHT,
+    )  # fmt: skip
+    pycolmap.set_random_seed(0)
+    model = pycolmap.synthesize_dataset(options)
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), model)
+    low, high = _focals(pycolmap, model, [model], None) or (0, 0)
+    assert 0.97 * FOCAL < low < high < 1.03 * FOCAL
+    assert _focals(pycolmap, model, [model], (200, 400)) == (200, 400)

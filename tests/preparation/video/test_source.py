@@ -94,4 +94,4 @@ def test_a_clip_is_named_after_its_video(tmp_path: Path) -> None:
     assert clip_named_after(tmp_path / "on the beach") == Path("clips/on-the-beach")
     assert clip_named_after(tmp_path / "Me & you.mp4") == Path("clips/Me-you")
     assert clip_named_after(Path("https://host/dance.mp4")) == Path("clips/dance")
-    assert clip_named_after(Path(".")) == Path("clips/mine")
+    assert clip_named_after(Path()) == Path("clips/mine")
