@@ -15,7 +15,7 @@ from hoigs.plugins.estimators.object_tracker.footage import (
     bins_of,
     histogram,
     odds_of,
-    torso_length,
+    usual_torso,
 )
 from hoigs.plugins.estimators.object_tracker.scene import Scene
 
@@ -32,7 +32,7 @@ class Likeness:
         people: landmarks of each.
         colors: log-odds of each bin of colours: around the hands against on the body and in the
             scene; None where no hands are known.
-        torso: its usual length in pixels; NaN where it is never seen.
+        torso: its usual length in pixels (`usual_torso`); NaN where nobody's is known.
     """
 
     footage: Footage
@@ -50,13 +50,12 @@ class Likeness:
         frames: Sequence[int],
     ) -> Likeness:
         """Learnt from some frames."""
-        lengths = [v for p in people for v in torso_length(p) if np.isfinite(v)]
-        torso = float(np.median(lengths)) if lengths else np.nan
+        torso = usual_torso(people)
         first = cls(footage, scene, people, None, torso)
         body: list[np.ndarray] = []
         around: list[np.ndarray] = []
         scenery: list[np.ndarray] = []
-        for i in frames if lengths else ():
+        for i in frames if np.isfinite(torso) else ():
             if not first._seen(i, WRISTS):
                 continue
             bins = bins_of(footage.colors(i))

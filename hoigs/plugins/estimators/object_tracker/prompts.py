@@ -58,6 +58,7 @@ def walked(
 
 
 RADII = (0.012, 0.022, 0.04, 0.065, 0.1, 0.16)  # of the object, in diagonals of the image
+TINY = (0.0065,)  # tried where what grew to the others is a person
 ROUNDS = 4
 AGAIN, ROOM = 2, 1.7  # growths about the middle of the last, in an ellipse of its area times this
 GROWN = 0.97  # intersection over union with the growth before, from which it grows no more
@@ -66,7 +67,9 @@ ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.75, 0.5  # share of the person's colours, and that no limb reaches: see below
 COMMON = 2.0  # times that a colour may be more frequent on a person than along their limbs
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
-WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18)  # of `_Judge.features`, by 83 clicks anywhere
+SCENE = 4.0  # units of noise up to which they look as the scene does
+# of `_Judge.features`: the last by 88 clicks anywhere, the others by 83
+WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 4.0)
 MOVING = np.array((0.3, 0.5))  # most that motion says: a part of what turns is set off, too
 POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
@@ -102,7 +105,7 @@ def prompted_mask(
     away = scene.difference(i)
     shown = seed if box is None else _filled(footage.shape, box)
     on_person = bool(footage.person[i][shown].mean() > 0.5) if shown.any() else False
-    at_rest = not median_of(away[seed]) > 4
+    at_rest = not median_of(away[seed]) > SCENE
     fixed = _evidence(footage.body(i), away, on_person, at_rest, box is not None)
     barred = footage.blank[i] | _disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))
     fixed[barred] = -9
@@ -110,15 +113,24 @@ def prompted_mask(
     if box is not None:
         barred = barred | ~shown
     growth = _Growth(footage, i, fixed, center, inside, known, box, footage.colors(i))
-    tried = growth.masks()
     judge = _Judge(footage, i, away, on_person, box, Motion.of(footage, i))
+    none = PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person, barred)
+
+    def best(tried: list[_Tried]) -> PromptedMask:
+        if not tried:
+            return none
+        k = int(judge.scores(tried).argmax())
+        return replace(none, soft=tried[k].soft, quality=judge.quality(tried)[k])
+
+    tried = growth.masks()
     if box is None and not at_rest and not on_person:
         tried += growth.unexplained(away)
-    if not tried:
-        return PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person, barred)
-    scores = judge.scores(tried)
-    k = int(scores.argmax())
-    return PromptedMask(i, tried[k].soft, judge.quality(tried)[k], on_person, barred)
+    found = best(tried)
+    if box is None and found.quality > 0 and looks_like_person(footage, found):
+        tiny = best(growth.masks(TINY))
+        if tiny.quality > 0 and not looks_like_person(footage, tiny):
+            return tiny
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,11 +188,12 @@ class _Judge:
         """Logarithms by which the best is chosen."""
         return self.features(tried) @ np.array(WEIGHTS)
 
-    def features(self, tried: list[_Tried]) -> Float[np.ndarray, "N 7"]:
+    def features(self, tried: list[_Tried]) -> Float[np.ndarray, "N 8"]:
         """What speaks for each mask: how well it is set off; how much it takes in of what differs
         from the scene; how common its colours are along limbs; how much better one motion explains
         it than what is around it, as shares and as differences; how far the other masks, which grew
-        at other sizes, agree with it; how large it is."""
+        at other sizes, agree with it; how large it is; and, if the click is on a person, how little
+        it takes in of the scene beside them."""
         masks = [t.soft > 0.5 for t in tried]
         part, bins = self._unexplained(masks), bins_of(self.footage.colors(self.i))
         taken = [0.0 if part is None else (m & part).sum() / part.sum() for m in masks]
@@ -194,7 +207,16 @@ class _Judge:
             *np.clip([self.motion.sets_off(m) for m in masks], -MOVING, MOVING).T,
             (alike.sum(1) - 1) / max(len(masks) - 1, 1),
             np.log(area),
+            np.log([max(1 - self._of_scene(m), 0.01) for m in masks]),
         ), -1)  # fmt: skip
+
+    def _of_scene(self, mask: Bool[np.ndarray, "h w"]) -> float:
+        """The share of a mask, grown from a click on a person, that is beside them and looks as the
+        scene does; 0 of other clicks."""
+        if not self.on_person:
+            return 0.0
+        still = (self.away <= SCENE) & ~self.footage.person[self.i]
+        return float((mask & still).sum() / max(mask.sum(), 1))
 
     def _unexplained(self, masks: list[np.ndarray]) -> Bool[np.ndarray, "h w"] | None:
         """The part of what differs from the scene and is no body that all masks meet; None where
@@ -248,7 +270,7 @@ def lies_on_people(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], most
 
 def _novelty(masks: list[np.ndarray], away: np.ndarray, diagonal: float) -> np.ndarray:
     """From 0.3 to 1: less for masks that take in more of the unchanged scene than others do."""
-    changed = np.nan_to_num(away, nan=0.0) > 4
+    changed = np.nan_to_num(away, nan=0.0) > SCENE
     # the inside of a plain thing that moves little looks unchanged: only its rim differs
     filled = ndimage.binary_closing(changed, iterations=max(1, round(0.012 * diagonal)))
     share = np.array([(filled & m).sum() / max(m.sum(), 1) for m in masks])
@@ -337,7 +359,7 @@ class _Growth:
     box: np.ndarray | None
     colors: Float[np.ndarray, "h w 3"]
 
-    def masks(self) -> list[_Tried]:
+    def masks(self, radii: tuple[float, ...] = RADII) -> list[_Tried]:
         """Those that grow, at several sizes, or odds of a box. A click is seldom in the middle:
         each size grows once more about the middle and in the shape of what it grew to."""
         if self.box is not None:
@@ -345,7 +367,7 @@ class _Growth:
             return _steadied([t for odds in INSIDE if (t := self._grown(half, odds)) is not None])
         reach = float(np.hypot(*(self.seeds - self.center).T).max())
         families: list[list[_Tried]] = [[] for _ in range(1 + AGAIN)]
-        for radius in RADII:
+        for radius in radii:
             found, before = self._grown(reach + radius * self.footage.diagonal), None
             for family in families:
                 if found is None:

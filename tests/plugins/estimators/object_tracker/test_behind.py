@@ -55,7 +55,7 @@ def seated(middles=once):
 
 
 def footage_of(frames: list[np.ndarray], people: list[np.ndarray]) -> Footage:
-    lab, none = np.stack([lab_of(f) for f in frames]), np.zeros((len(frames), H, W), bool)
+    lab, none = np.stack([lab_of(f) for f in frames]), np.zeros_like(people)
     return Footage(tuple(range(len(frames))), 1.0, lab, np.stack(people), none, none)
 
 

@@ -14,7 +14,9 @@ from hoigs.plugins.estimators.object_tracker.appearance import Appearance, half_
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.prompts import (
     lies_on_people,
+    looks_like_person,
     of_person,
+    overlap,
     prompted_mask,
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
@@ -276,3 +278,30 @@ def test_a_hand_that_was_clicked_is_doubtful() -> None:
     soft = np.uint8(255) * np.stack([np.hypot(X - 40, Y - 40) < 5, cup])
     states = states_of(footage_of([image, shown], [person] * 2), {"o": Track(soft, np.ones(2))})
     assert states["o"] == [DOUBTFUL, SEEN]
+
+
+def drinker(height: int = 360, width: int = 480):
+    """A tall person in a mottled shirt, whose mask takes in the paper cup before their chest."""
+    wall = texture(0, (120, 130, 90), (height, width))
+    cloth = np.array((150, 90, 80))
+    shirt = np.clip(cloth + 1.4 * (texture(3, (150, 90, 80), (height, width)) - cloth), 0, 255)
+    y, x = np.mgrid[:height, :width] + 0.5
+    frames, people, cups = [], [], []
+    for i in range(8):
+        person = (np.abs(x - 240 - 8 * np.sin(i)) < 60) & (y > 60)
+        cup = (np.abs(x - 235 - 8 * np.sin(i)) < 3.5) & (np.abs(y - 120 - 2 * i) < 4.5)
+        image = np.where(person[..., None], shirt, wall)
+        image[cup] = 196, 150, 138
+        frames.append(image.astype(np.uint8))
+        people.append(person)
+        cups.append(cup)
+    return frames, people, cups
+
+
+def test_a_click_on_what_is_tiny_does_not_take_in_the_shirt_behind_it() -> None:
+    frames, people, cups = drinker()
+    footage = footage_of(frames, people)
+    y, x = np.argwhere(cups[3]).mean(0) + 0.5
+    found = prompted_mask(footage, static_scene(footage), 3, FramePrompt(3, (PromptPoint(x, y),)))
+    assert not looks_like_person(footage, found)
+    assert overlap(found.soft > 0.5, cups[3]) > 0.5
