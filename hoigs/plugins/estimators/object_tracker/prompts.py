@@ -68,8 +68,9 @@ OF_PERSON, HELD = 0.75, 0.5  # share of the person's colours, and that no limb r
 COMMON = 2.0  # times that a colour may be more frequent on a person than along their limbs
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
 SCENE = 4.0  # units of noise up to which they look as the scene does
-# of `_Judge.features`: the last by 88 clicks anywhere, the others by 83
-WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 4.0)
+BESIDE = 0.1  # of a mask on a person: what looks like the scene beside them counts from there on
+# of `_Judge.features`: the last by 143 clicks anywhere, the others by 83
+WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 3.0)
 MOVING = np.array((0.3, 0.5))  # most that motion says: a part of what turns is set off, too
 POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
@@ -207,7 +208,7 @@ class _Judge:
             *np.clip([self.motion.sets_off(m) for m in masks], -MOVING, MOVING).T,
             (alike.sum(1) - 1) / max(len(masks) - 1, 1),
             np.log(area),
-            np.log([max(1 - self._of_scene(m), 0.01) for m in masks]),
+            np.log([min(1 - self._of_scene(m) + BESIDE, 1) for m in masks]),
         ), -1)  # fmt: skip
 
     def _of_scene(self, mask: Bool[np.ndarray, "h w"]) -> float:
