@@ -63,6 +63,7 @@ ROUNDS = 4
 AGAIN, ROOM = 2, 1.7  # growths about the middle of the last, in an ellipse of its area times this
 GROWN = 0.97  # intersection over union with the growth before, from which it grows no more
 USUAL, LARGEST = 0.25, 0.55  # of the person's mask: what a held thing may, and cannot, cover of it
+AT_PERSON = 0.2  # share of a click on a person, from which the object may lie on them, too
 ON_PERSON = 0.6  # share of a mask on people, from which it lies on them
 OF_PERSON, HELD = 0.75, 0.5  # share of the person's colours, and that no limb reaches: see below
 COMMON = 2.0  # times that a colour may be more frequent on a person than along their limbs
@@ -82,7 +83,7 @@ class PromptedMask:
 
     Attributes:
         soft: probability of each pixel of the frame. quality: how well it is set off, 0 to 1.
-        on_person: the click lies on the person's mask.
+        on_person: the click lies on the person's mask, or at its edge.
         barred: pixels that the prompt rules out.
     """
 
@@ -105,7 +106,8 @@ def prompted_mask(
     seed = _disc(footage.shape, inside, max(1.5, 0.005 * footage.diagonal))
     away = scene.difference(i)
     shown = seed if box is None else _filled(footage.shape, box)
-    on_person = bool(footage.person[i][shown].mean() > 0.5) if shown.any() else False
+    least = AT_PERSON if box is None else 0.5
+    on_person = bool(footage.person[i][shown].mean() > least) if shown.any() else False
     at_rest = not median_of(away[seed]) > SCENE
     fixed = _evidence(footage.body(i), away, on_person, at_rest, box is not None)
     barred = footage.blank[i] | _disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))
