@@ -24,7 +24,7 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.reporting import Progress, no_progress
 from hoigs.core.system.threads import one_thread
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
-from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage, skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import (
     PromptedMask,
@@ -54,7 +54,11 @@ from hoigs.plugins.estimators.object_tracker.states import (
     mostly_doubtful,
     states_of,
 )
-from hoigs.plugins.estimators.object_tracker.together import followed_together, groups_of
+from hoigs.plugins.estimators.object_tracker.together import (
+    followed_together,
+    groups_of,
+    rivals_of,
+)
 from hoigs.plugins.estimators.object_tracker.tracker import (
     Said,
     at_rest,
@@ -217,9 +221,8 @@ class ObjectTrackerEstimator(Estimator):
             for n, m in prompts.items()
             if m and n not in rods
         }
-        groups = groups_of(
-            prompts, {n: twins_of(k, masks_of(prompts[n])) for n, k in looks.items()}
-        )
+        rivals = {n: rivals_of(footage, scene, k, masks_of(prompts[n])) for n, k in looks.items()}
+        groups = groups_of(prompts, rivals)
         equal = {n for _, group in groups for n in group}
         done = 0.35
         for frame, group in groups:

@@ -15,7 +15,8 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 # How the picture of the scene moves between frames: homographies, from matched blocks.
 
 STILL = 0.35  # pixels between frames below which a camera counts as static
-ALWAYS = 0.95  # of the frames, in which a border that belongs to the video is black
+# of the frames, in which the pixels of a border that comes and goes show a picture, and of them
+SHOWN, COMES, LIT = 0.2, 0.002, 20  # such pixels of all; their lightness, of 255
 BLOCK = 48
 
 
@@ -31,7 +32,7 @@ def homographies(footage: Footage) -> Float[np.ndarray, "F 3 3"]:
 def is_static(footage: Footage, samples: int = 16) -> bool:
     """Whether the picture of the scene stays where it is, by blocks of frames across the video. A
     black border that comes and goes is that of a video which was stabilised; one that stays is a
-    letterbox."""
+    letterbox, or a dark wall at the edge of the picture."""
     picks = np.unique(np.linspace(0, len(footage) - 1, samples).astype(int))
     moved = []
     for a, b in pairwise(picks):
@@ -41,7 +42,8 @@ def is_static(footage: Footage, samples: int = 16) -> bool:
             order = np.hypot(*shift.T).argsort()
             share = weight[order].cumsum() / weight.sum()
             moved.append(np.hypot(*shift.T)[order][np.searchsorted(share, 0.5)])
-    comes = (footage.blank.any(0) & (footage.blank.mean(0) < ALWAYS)).any()
+    lit = (footage.lab[..., 0] > LIT) & ~footage.person & ~footage.blank
+    comes = (footage.blank.any(0) & (lit.mean(0) > SHOWN)).mean() > COMES
     return bool(moved) and float(np.median(moved)) < 2 * STILL and not comes
 
 

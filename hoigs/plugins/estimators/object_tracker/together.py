@@ -16,13 +16,18 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.appearance import learnt_beside_twins
+from hoigs.plugins.estimators.object_tracker.appearance import (
+    Appearance,
+    learnt_beside_twins,
+    twins_of,
+)
 from hoigs.plugins.estimators.object_tracker.footage import Footage, Window
 from hoigs.plugins.estimators.object_tracker.path import Evidence, center_of, object_odds
 from hoigs.plugins.estimators.object_tracker.places import Place, Shape, places_of
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, walked
+from hoigs.plugins.estimators.object_tracker.prompts import AT_PERSON, SCENE, PromptedMask, walked
 from hoigs.plugins.estimators.object_tracker.propagation import Track
-from hoigs.plugins.estimators.object_tracker.tracker import color_model, masks_of
+from hoigs.plugins.estimators.object_tracker.scene import Scene, StaticScene
+from hoigs.plugins.estimators.object_tracker.tracker import at_rest, color_model, masks_of
 
 Twins = Mapping[int, Bool[np.ndarray, "h w"]]  # by frame
 
@@ -56,6 +61,38 @@ def groups_of(
             ]  # fmt: skip
         groups.append((frame, group))
     return groups
+
+
+WATCHED = 24  # frames in which a rival is looked at
+CHANGED = 0.25  # of a rival and its rim: what differs from the scene if it moves
+
+
+def rivals_of(
+    footage: Footage, scene: Scene, looks: Appearance, known: Mapping[int, Bool[np.ndarray, "h w"]]
+) -> Twins:
+    """The `twins_of` an object that may be taken for it: before a static camera, if somebody holds
+    the object where it was clicked, or it is no part of the scene there, those that move, unlike a
+    picture on the wall."""
+    found = {}
+    for i, twins in twins_of(looks, known).items():
+        labels, count = ndimage.label(twins)
+        every = range(1, count + 1)
+        held = footage.person[i][known[i]].mean() > AT_PERSON
+        if isinstance(scene, StaticScene) and (held or not at_rest(scene, {i: known[i]})):
+            every = [k for k in every if _ever_moves(footage, scene, labels == k)]
+        if every:
+            found[i] = np.isin(labels, every)
+    return found
+
+
+def _ever_moves(footage: Footage, scene: Scene, region: Bool[np.ndarray, "h w"]) -> bool:
+    """Whether a region differs from the scene in any frame, people before it left out."""
+    for i in np.unique(np.linspace(0, len(footage) - 1, WATCHED).astype(int)):
+        seen = region & ~footage.person[i]
+        changed = (scene.difference(i)[seen] > SCENE).sum()
+        if 2 * seen.sum() > region.sum() and changed > CHANGED * seen.sum():
+            return True
+    return False
 
 
 # Joint paths through the places of all frames.

@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from disc_world import COUNT, RADIUS, H, W, masks_of, request, texture
+from test_behind import footage_of
 
 from hoigs.core.interfaces.estimator import EntityRequest, FramePrompt, PromptPoint
+from hoigs.plugins.estimators.object_tracker.appearance import Appearance, twins_of
 from hoigs.plugins.estimators.object_tracker.places import Shape, places_of
 from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
+from hoigs.plugins.estimators.object_tracker.scene import static_scene
 from hoigs.plugins.estimators.object_tracker.together import (
     CLEAR,
     LONG,
@@ -20,6 +23,7 @@ from hoigs.plugins.estimators.object_tracker.together import (
     cheapest,
     groups_of,
     lasting,
+    rivals_of,
 )
 
 Y, X = np.mgrid[:H, :W] + 0.5
@@ -149,6 +153,26 @@ def test_two_equal_discs_that_cross_keep_their_names(tmp_path: Path) -> None:
         share = np.array([(m & t).sum() / max((m | t).sum(), 1) for m, t in zip(masks, true)])
         assert not any(m.any() and (m & t).sum() < 0.5 * m.sum() for m, t in zip(masks, true))
         assert (share > 0.6).mean() > 0.8, share
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_what_hangs_on_the_wall_is_no_rival_of_what_is_held(moves: bool) -> None:
+    wall, ball = texture(0, (120, 130, 90)), np.uint8(texture(1, (200, 60, 50)))[:40, :40]
+    frames, people, held = [], [], []
+    for i in range(COUNT):
+        image = np.uint8(wall[:, :W])
+        mine = disc(30, 24 + 2 * i)
+        for mask, y in ((mine, 24 + 2 * i), (disc(86, 34 + 2 * moves * i), 34 + 2 * moves * i)):
+            rolled = np.roll(ball, (y % 40, 0), (0, 1))
+            image[mask] = rolled[np.ix_(np.arange(H) % 40, np.arange(W) % 40)][mask]
+        frames.append(image)
+        held.append(mine)
+        people.append(mine)
+    footage = footage_of(frames, people)
+    known = {0: held[0]}
+    looks = Appearance.learnt(footage, known)
+    assert twins_of(looks, known)
+    assert bool(rivals_of(footage, static_scene(footage), looks, known)) == moves
 
 
 def test_an_object_that_was_not_seen_for_long_may_be_anywhere() -> None:

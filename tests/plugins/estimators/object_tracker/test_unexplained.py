@@ -79,3 +79,6 @@ def test_a_letterbox_is_no_border_of_a_stabilised_video() -> None:
     assert is_static(footage) and is_static(replace(footage, blank=bars))
     bars[COUNT // 2 :] = False
     assert not is_static(replace(footage, blank=bars))
+    dark = footage.lab.copy()  # a wall that is nearly black, and black in some frames
+    dark[:, :6] = 4, 128, 128
+    assert is_static(replace(footage, blank=bars, lab=dark))
