@@ -15,8 +15,8 @@ from hoigs.plugins.estimators.object_tracker.footage import Footage, to_features
 # How the picture of the scene moves between frames: homographies, from matched blocks.
 
 STILL = 0.35  # pixels between frames below which a camera counts as static
-# of the frames, in which the pixels of a border that comes and goes show a picture, and of them
-SHOWN, COMES, LIT = 0.2, 0.002, 20  # such pixels of all; their lightness, of 255
+SHOWN = 0.2  # of the frames, in which a black border that comes and goes shows a picture
+COMES, LIT = 0.002, 20  # such pixels of all, from which there is one; their lightness, of 255
 BLOCK = 48
 
 
