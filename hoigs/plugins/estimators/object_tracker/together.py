@@ -76,7 +76,7 @@ def rivals_of(
     found = {}
     for i, twins in twins_of(looks, known).items():
         labels, count = ndimage.label(twins)
-        every = range(1, count + 1)
+        every = [*range(1, count + 1)]
         held = footage.person[i][known[i]].mean() > AT_PERSON
         if isinstance(scene, StaticScene) and (held or not at_rest(scene, {i: known[i]})):
             every = [k for k in every if _ever_moves(footage, scene, labels == k)]
