@@ -64,7 +64,7 @@ def structure_from_motion(
     COLMAP verifies pairs of images with the focal length at the start, and a bad guess leaves no
     pair; so several are tried until half of the frames have a camera. A camera that turns more than
     it travels is explained by several focal lengths, each with cameras of its own: what was found
-    is sought once more from the start that is farthest from it.
+    is sought once more from the start that is farthest from it, of those that were not tried yet.
 
     Features on masked pixels are left out; frames are matched with their neighbours in time; one
     camera with one radial distortion serves all (COLMAP, Schoenberger and Frahm 2016).
@@ -106,8 +106,9 @@ def structure_from_motion(
             report(begun + 0.3 / (len(tried) + 1))
             return _mapped(pycolmap, matches, images, folder / "models" / str(number), lens)
 
-        for number in range(len(tried)):
-            model = started(number)
+        left = [*range(len(tried))]
+        while left:
+            model = started(left.pop(0))
             found += [] if model is None else [model]
             if model is not None and model.num_reg_images() >= enough:
                 break
@@ -115,9 +116,8 @@ def structure_from_motion(
         if best is None or best.num_reg_images() < enough:
             raise SourceError(_too_few(best, video, tried))
         models, known = [best], lens is not None or focal is not None
-        if not known:
-            far = max(range(len(tried)), key=lambda n: _ratio(tried[n], _focal(best)))
-            again = started(far)
+        if left and not known:  # a start that failed before confirms nothing
+            again = started(max(left, key=lambda n: _ratio(tried[n], _focal(best))))
             models += [again] if again and again.num_reg_images() >= enough else []
         confirmed = known or (len(models) > 1 and _ratio(*map(_focal, models)) <= SAME)
         if not confirmed:

@@ -14,6 +14,7 @@ from PIL import Image
 from scipy import ndimage
 
 from hoigs.preparation.body.landmarks import Landmarks
+from hoigs.preparation.cameras import sfm
 from hoigs.preparation.cameras.choose import BesideVideo, ChosenCameras, choose_cameras
 from hoigs.preparation.cameras.sfm import _focals, _what_to_do, structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import background_motion
@@ -301,3 +302,31 @@ def test_how_far_a_focal_length_is_known() -> None:
     low, high = _focals(pycolmap, model, [model], None) or (0, 0)
     assert 0.97 * FOCAL < low < high < 1.03 * FOCAL
     assert _focals(pycolmap, model, [model], (200, 400)) == (200, 400)
+
+
+@pytest.mark.parametrize(("works", "tried", "confirmed"), [
+    ({0: 300.0, 2: 301.0}, [0, 2], True),
+    ({0: 300.0, 2: 400.0}, [0, 2], False),
+    ({3: 170.0}, [0, 1, 2, 3], False),  # the last start: no other is left to confirm it
+])  # fmt: skip
+def test_no_start_confirms_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, works: dict[int, float], tried: list[int],
+    confirmed: bool,
+) -> None:  # fmt: skip
+    video, masks = recorded(tmp_path / "moves", [0.1 * i for i in range(2)])
+    starts = []
+
+    def mapped(_colmap: Any, _matches: Path, _images: Path, folder: Path, _lens: Any) -> Any:
+        starts.append(int(folder.name))
+        focal = works.get(starts[-1])
+        return focal and SimpleNamespace(
+            cameras={1: SimpleNamespace(params=[focal])}, images={}, num_reg_images=lambda: 2,
+            compute_num_observations=lambda: 9, write=lambda _folder: None,
+        )  # fmt: skip
+
+    for name in ("_extract", "_match"):
+        monkeypatch.setattr(sfm, name, lambda *_: None)
+    monkeypatch.setattr(sfm, "_mapped", mapped)
+    found = structure_from_motion(video, masks, tmp_path / "work")
+    assert starts == tried and found.confirmed == confirmed
+    assert found.focals is not None and found.focals[0] <= min(works.values())
