@@ -36,7 +36,7 @@ def test_the_newest_are_kept(tmp_path: Path, keep: int | None, kept: list[int]) 
 
 
 def test_those_for_a_viewer_are_removed_again(tmp_path: Path, monkeypatch) -> None:
-    spec = TrainSpec(steps=9, checkpoint_every=5)
+    spec = TrainSpec(steps=9, checkpoint_every=5, keep_checkpoints=None)
     monkeypatch.setattr(checkpointing, "VIEW_SECONDS", 3600.0)
     assert steps_kept(tmp_path / "one", spec, viewed=True, stop_at=4) == [4]
     monkeypatch.setattr(checkpointing, "VIEW_SECONDS", 0.0)
