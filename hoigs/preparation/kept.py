@@ -62,7 +62,7 @@ PLAN = {
         version=5,
     ),
     "object_masks": Stage(
-        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=9
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=10
     ),
     "cameras": Stage(
         3,
@@ -79,7 +79,7 @@ PLAN = {
     ),
     "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True, version=3),
     "objects": Stage(
-        40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=5
+        40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=6
     ),
     "scene": Stage(10, ("masks",), ("prompts", "scene_points", "backdrop"), slow=True, version=2),
     "write": Stage(40, ("objects", "scene")),

@@ -207,8 +207,8 @@ class TrainSpec(_Strict):
     checkpoint_every: int = Field(default=1000, ge=1)
     """Steps between checkpoints; the last step always writes one."""
     keep_checkpoints: int | None = Field(default=2, ge=1)
-    """How many of the newest checkpoints are kept, so that the one before the newest is there if that
-    is damaged; null keeps all."""
+    """How many of the newest checkpoints are kept, so that there is another one if the newest is
+    damaged; null keeps all."""
     log_every: int = Field(default=25, ge=1)
     """Steps between lines of the log; the last step always writes one."""
     preview_every: int = Field(default=250, ge=0)

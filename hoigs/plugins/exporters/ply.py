@@ -125,9 +125,7 @@ class PlyExporter(TurnedExporter):
         data = ply_bytes(move.gaussians(state.joined()), pad_sh=self.config.pad_sh)
         progress(0.5, "writing")
         (folder / "scene.ply").write_bytes(data)
-        lost = {
-            "whose a Gaussian is": "all are one list; --entities exports those of one entity"
-        }
+        lost = {"whose a Gaussian is": "all are one list; --entities exports those of one entity"}
         if len(request.entities) < 2:
             lost = {}
         if len(request.moments) > 1:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hoigs.core.maths.rotations import axis_angle_to_matrices
@@ -39,6 +39,10 @@ ROUNDS, NEAR, LEAST = 6, 0.02, 1e-5  # of Gauss and Newton; of half a crop; adde
 LEVELS = ((2.5, 12.0), FINE)
 STEPS, RATE, SMOOTH = 40, 0.015, 0.02
 FARTHEST = 0.3  # radians or metres of a step
+# From what the hands at it say of its distance: how far off is wrong, in the median of what all are
+# off (4.5: three standard deviations), and at least, of its distance.
+OFF, LEAST_OFF = 4.5, 0.05
+OVERLAPS = 0.6  # of the picture with a mask, from which it is laid over it
 PART = 0.5  # of the frames that show a place: so many have to show the thing there
 GRIP = 0.04  # metres between a knuckle of a fitted body and the plane that it holds, about
 THIN = 0.01  # of its radius: half its thickness
@@ -106,7 +110,7 @@ def plate_object(
     _, row, planes = min(tried, key=lambda t: t[0])
     planes, share, alike = refined(crops, row, planes, seen.filmed.fps)
     progress(0.9)
-    sure = (alike >= AGREES).numpy()
+    sure = ((alike >= AGREES) & (share >= OVERLAPS)).numpy()
     if int(sure.sum()) < max(FEWEST, PART * len(crops)):
         raise UntrackableError(
             f"{int(sure.sum())} of {len(crops)} frames show the same flat picture as frame "
@@ -130,6 +134,7 @@ def plate_object(
     shown[crops.frames[sure]] = True
     at = torch.nn.functional.pad(size * middle, (0, 1))
     rotations, places = between(poses.rows(np.flatnonzero(sure)), at, shown, hands)
+    places = by_masks(seen, shown, places)
     off = size * area**0.5 / 4 * (1 - share)  # of a square as large
     track = ObjectTrack(
         points=points,
@@ -149,6 +154,30 @@ def plate_object(
         float(hands.rests.mean()), palm_distances(hands, points, normals, rotations, places),
     )  # fmt: skip
     return track, normals, spread, confidence
+
+
+def by_masks(
+    seen: Watched, sure: Bool[np.ndarray, " F"], places: Float[Tensor, "F 3"]
+) -> Float[Tensor, "F 3"]:
+    """Places of the frames with a mask that shows too little of the picture, as where it glares, or
+    that puts it far from the hands at it: in the middle of their masks, and as far from the hands
+    as in most frames that are sure."""
+    cameras, hands = seen.filmed.cameras, seen.hands
+    depths = np.array([
+        float(camera.to_camera(place)[2]) for camera, place in zip(cameras, places, strict=True)
+    ])  # fmt: skip
+    held = hands.near.any(1)
+    if (sure & held).any():
+        ratios = np.log(depths / hands.depths)
+        usual = np.median(ratios[sure & held])
+        off = np.abs(ratios - usual)
+        sure = sure & ~(held & (off > max(LEAST_OFF, OFF * np.median(off[sure & held]))))
+        depths = np.where(held, np.exp(usual) * hands.depths, depths)
+    found = places.clone()
+    for i in np.flatnonzero(seen.outlines.observed & ~sure).tolist():
+        middle = torch.from_numpy(seen.outlines.centers[i]).float()
+        found[i] = cameras[i].unproject(middle, torch.tensor(float(depths[i])))
+    return found
 
 
 def likeliest(

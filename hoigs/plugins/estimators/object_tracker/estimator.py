@@ -50,6 +50,7 @@ from hoigs.plugins.estimators.object_tracker.scene import (
 from hoigs.plugins.estimators.object_tracker.states import (
     DOUBTFUL,
     SEEN,
+    covers_torso,
     is_worn,
     mostly_doubtful,
     states_of,
@@ -125,7 +126,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 27  # of what is kept in `work`; raised when masks change
+VERSION = 28  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -133,6 +134,10 @@ VAGUE = (
 CLOTHES = (
     "what was taken never leaves one person's torso and thighs and may be their clothes: no mask "
     "of it counts as seen; click on the object"
+)
+SHIRT = (
+    "what was taken covers one person's torso and hardly reaches beyond it: that is rather their "
+    "clothes, and is dropped; click on the object"
 )
 EQUAL = (
     "other things look the same, so that only its path tells which is which; where it does not, "
@@ -252,14 +257,17 @@ class ObjectTrackerEstimator(Estimator):
         others = {n: [] if n in equal or n in rods else masks for n, masks in prompts.items()}
         tracks, alike = told_apart(footage, scene, others, {e.name: tracks[e.name] for e in wanted})
         vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
-        tracks |= dict.fromkeys(vague)
+        taken = {n: t.soft > 127 for n, t in tracks.items() if n in chosen and t is not None}
+        shirts = [n for n, m in taken.items() if n not in vague and covers_torso(m, people)]
+        tracks |= dict.fromkeys((*vague, *shirts))
         states = states_of(footage, tracks)
         worn = [n for n, t in tracks.items() if n in chosen and t and is_worn(t.soft > 127, people)]
         clicked = [n for n, m in prompts.items() if m and n not in chosen]
         faint = [n for n in clicked if all(_looks_like_scenery(scene, p) for p in prompts[n])]
         scenery = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
         states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *scenery)}
-        said = [f"{n}: {why}" for names, why in ((vague, VAGUE), (worn, CLOTHES)) for n in names]
+        why = ((vague, VAGUE), (shirts, SHIRT), (worn, CLOTHES))
+        said = [f"{n}: {reason}" for names, reason in why for n in names]
         notes += [*alike, *said, *doubts(tracks, footage)]
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states))
 

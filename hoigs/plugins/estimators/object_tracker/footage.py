@@ -25,6 +25,8 @@ LIMBS = (
 )  # fmt: skip
 SHOULDERS, HIPS = (11, 12), (23, 24)
 TRUNK = tuple((ends, radius) for ends, radius in LIMBS if {*ends} <= {11, 12, 23, 24, 25, 26})
+TORSO = tuple((ends, radius) for ends, radius in LIMBS if {*ends} <= {11, 12, 23, 24})
+SLEEVES = tuple((ends, radius) for ends, radius in LIMBS if ends in ((11, 13), (12, 14)))
 # Pairs of landmarks between which the body itself is seen, if anything of it is: what lies farther
 # in front of the body than its limbs hides the middle of the torso first.
 BARE = (

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hoigs.plugins.estimators.object_tracker.footage import (
+    SLEEVES,
+    TORSO,
     TRUNK,
     Footage,
     limbs,
@@ -20,6 +23,7 @@ from hoigs.plugins.estimators.object_tracker.propagation import Track
 SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a person"
 DOUBTFUL = "doubtful"  # there is a mask, and it may be a part of a person or of the scene
 WORN, FEWEST = 0.9, 5  # share of a mask, and of the frames, that are clothes; frames that say so
+CLOTHED, COVERS = 0.85, 0.35  # share of a shirt that torso and sleeves hold, and of the torso
 RIM = 2  # pixels from the edge of the picture within which a mask reaches it
 RECENT = 8  # frames before it was seen last that say how it moved
 BEYOND = 0.5  # of what was seen of it last: what has less left in the picture is out of it
@@ -79,6 +83,30 @@ def is_worn(
             trunk = limbs(masks.shape[1:], landmarks[i], torso[i], TRUNK)
             within += [] if trunk is None else [trunk[masks[i]].mean() > WORN]
         if len(within) >= FEWEST and np.mean(within) > WORN:
+            return True
+    return False
+
+
+def covers_torso(
+    masks: Bool[np.ndarray, "F h w"], people: Sequence[Float[np.ndarray, "F 33 4"]]
+) -> bool:
+    """Whether an object covers much of one person's torso and hardly reaches beyond torso, thighs
+    and upper arms: their shirt, which sleeves and folds make larger than `is_worn` allows.
+
+    Frames in which the person's torso is not seen say nothing.
+
+    Args:
+        masks: of the object. people: landmarks of each person, pixels and visibility.
+    """
+    for landmarks in people:
+        length, within, covered = torso_length(landmarks), list[float](), list[float]()
+        for i in np.flatnonzero(masks.any((1, 2))):
+            of_body = partial(limbs, masks.shape[1:], landmarks[i], length[i])
+            torso, clothes = of_body(TORSO), of_body((*TRUNK, *SLEEVES))
+            if torso is not None and clothes is not None:
+                within.append(float(clothes[masks[i]].mean()))
+                covered.append(float(masks[i][torso].mean()))
+        if len(within) >= FEWEST and np.mean(within) > CLOTHED and np.mean(covered) > COVERS:
             return True
     return False
 

@@ -92,6 +92,7 @@ def _set_off(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
 
 
 SAME = 0.7  # intersection over union from which two passes agree on a frame
+PART, SURE = 0.95, 0.6  # of the second pass that lies within the first, if that is so sure
 NEARLY_ALL = 0.95  # share of the frames from which no second look for the object is worth it
 
 
@@ -116,7 +117,8 @@ def followed(
     proof = proof_of(footage, scene, prompts, first, looks, known)
     found = without_unproven(first, proof)
     best, alike = anchors(footage, found, prompts, proof.arrived), False
-    enough = proof.proven.mean() >= NEARLY_ALL and isinstance(scene, StaticScene)
+    by_looks = proof.proven.sum() - len(proof.arrived)  # others need to be known better
+    enough = by_looks >= NEARLY_ALL * len(footage) and isinstance(scene, StaticScene)
     if best and not enough:
         # where others are like it in prompted frames, as shoes like a ball, any is as good
         any_is = bool(twins_of(looks, known))
@@ -194,11 +196,14 @@ def tracked(
 
 
 def _joined(first: Track, again: Track) -> Track:
-    """The first pass where both have about the same: what comes from fewer frames drifts more, but
-    is not tied to the small faults of more of them. Elsewhere the surer one."""
-    pairs = zip(first.soft > 127, again.soft > 127, strict=True)
+    """The first pass where both have about the same, or it is sure and the second has a part of
+    its mask: what comes from fewer frames drifts more, but is not tied to the small faults of more
+    of them, and a part is surer than the whole. Elsewhere the surer one."""
+    pairs = [(a > 127, b > 127) for a, b in zip(first.soft, again.soft, strict=True)]
     same = np.array([bool(a.any()) and overlap(a, b) > SAME for a, b in pairs])
-    kept = same | (first.confidence > again.confidence)
+    part = np.array([bool(b.any()) and (a & b).sum() > PART * b.sum() for a, b in pairs])
+    part &= first.confidence > SURE
+    kept = same | part | (first.confidence > again.confidence)
     return Track(
         np.where(kept[:, None, None], first.soft, again.soft),
         np.where(kept, first.confidence, again.confidence),

@@ -11,8 +11,9 @@ are dropped: none is better than a wrong one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass, field
+from itertools import takewhile
 
 import numpy as np
 import torch
@@ -62,17 +63,18 @@ class Bounds:
     """Agreements that are asked for.
 
     Attributes:
-        proven: by itself. carried: between proven frames, without a gap, or where motion leads from
-            one. again: at most, of a frame before which it was not seen for long.
+        proven: by itself. carried: between proven frames, without a gap. moved: where motion leads
+            from one. again: at most, of a frame before which it was not seen for long.
     """
 
     proven: float = 0.5
     carried: float = 0.3
+    moved: float = 0.1
     again: float = 0.7
 
     def halved(self) -> Bounds:
         """With half of the doubt that is left otherwise."""
-        return Bounds(*((1 + bound) / 2 for bound in (self.proven, self.carried, self.again)))
+        return Bounds(*((1 + bound) / 2 for bound in astuple(self)))
 
 
 @dataclass(frozen=True)
@@ -284,22 +286,26 @@ def _continued(
         near = agreement[i] >= least and off <= STEP * max(size[i], size[last]) * gap
         return bool(near) and not (motions and motions.was_beside(i, last))
 
-    def carried_on(start: int, frames: Sequence[int]) -> list[int]:
-        return motions.carried_on(start, frames) if motions else []
+    def carried_on(start: int, end: int, step: int) -> list[int]:
+        frames = range(start + step, end, step)
+        alike = takewhile(lambda i: i not in given and agreement[i] >= bounds.moved, frames)
+        return motions.carried_on(start, alike) if motions else []
 
     for start in given:
         for step in (1, -1):
-            last, speed, half = start, np.zeros(2), list[int]()
-            proven = (last, speed)
-            for i in range(start + step, len(masks) if step > 0 else -1, step):
+            last, speed, half, kept = start, np.zeros(2), list[int](), list[int]()
+            proven, end = (last, speed), len(masks) if step > 0 else -1
+            for i in range(start + step, end, step):
                 if i in given:
                     found[half] = True
                     break
-                if half and not follows(i, last, speed):
-                    kept = carried_on(proven[0], half)
+                if i in kept:
+                    continue
+                if abs(i - last) == 1 and last not in kept and not follows(i, last, speed):
+                    kept = carried_on(proven[0], end, step)
                     found[kept] = True
                     (last, speed), half = (kept[-1], np.zeros(2)) if kept else proven, []
-                if not follows(i, last, speed):
+                if i in kept or not follows(i, last, speed):
                     continue
                 moved = place[i] - place[last]
                 speed = 0.5 * (speed + moved) if abs(i - last) == 1 else np.zeros(2)
@@ -308,7 +314,7 @@ def _continued(
                     found[half] = True
                     proven, half = (last, speed), []
             else:
-                found[carried_on(proven[0], half)] = True
+                found[carried_on(proven[0], end, step) if half else []] = True
     return found
 
 
@@ -325,7 +331,7 @@ class Motions:
     arrived: dict[int, float] = field(default_factory=dict)
     _beside: dict[tuple[int, int], bool] = field(default_factory=dict)
 
-    def carried_on(self, start: int, frames: Sequence[int]) -> list[int]:
+    def carried_on(self, start: int, frames: Iterable[int]) -> list[int]:
         """How far the mask of a frame, moved on from frame to frame, agrees with the masks of the
         next ones. A mask that slides off the object does not move as the object's pixels do."""
         moved, last, found = self.masks[start], start, list[int]()

@@ -168,6 +168,10 @@ def test_a_mask_of_doubtful_looks_is_believed_as_far_as_its_own_motion_carries_i
     stays.masks[3:] = masks[2]
     assert _continued(masks, agreement, [0], Bounds(), follows).all()
     assert {*follows.arrived} == {2, 3, 4} and min(follows.arrived.values()) > 0.6
+    little, none = np.array([1.0, 0.9, 0.15, 0.12, 0.4]), np.array([1.0, 0.9, 0.05, 0.4, 0.4])
+    assert _continued(masks, little, [0], Bounds(), Motions(footage, masks)).all()
+    found = _continued(masks, none, [0], Bounds(), Motions(footage, masks))
+    assert found.astype(int).tolist() == [1, 1, 0, 0, 0]
     found = _continued(stays.masks, agreement, [0], Bounds(), stays)
     assert found[:3].all() and not found[4:].any()
 
