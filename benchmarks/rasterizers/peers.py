@@ -50,14 +50,15 @@ Draw = Callable[[Gaussians, Camera], tuple[Tensor, ...]]  # colour [H, W, 3], th
 
 
 def differentiated(draw: Draw) -> Callable[[Gaussians, Camera], Round]:
-    """A round of a drawing function that autograd differentiates."""
+    """A round of a drawing function that autograd differentiates, by the same leaves every time, as
+    the parameters of a training are."""
 
     def prepare(gaussians: Gaussians, camera: Camera) -> Round:
+        leaves = gaussians.map(lambda x: x.detach().requires_grad_())
         upstream: list[Tensor] = []
         kept: list[tuple[Tensor, ...]] = []
 
         def forward() -> Tensor:
-            leaves = gaussians.map(lambda x: x.detach().requires_grad_())
             kept[:] = [draw(leaves, camera)]
             return kept[0][0].detach()
 
@@ -66,6 +67,8 @@ def differentiated(draw: Draw) -> Callable[[Gaussians, Camera], Round]:
             if not upstream:
                 upstream.extend(torch.rand_like(x) for x in outputs)
             torch.autograd.backward(outputs, upstream)
+            for leaf in leaves.tensors().values():
+                leaf.grad = None
 
         return Round(forward, backward)
 

@@ -48,6 +48,14 @@ def once(round_: Round, device: torch.device) -> tuple[Sample, Tensor]:
     return Sample(middle - start, end - middle, 1e3 * (time.process_time() - cores)), picture
 
 
+def peak_bytes(round_: Round, device: torch.device) -> int:
+    """Most bytes of torch's CUDA allocator in one round, beside what is there before it."""
+    torch.cuda.reset_peak_memory_stats(device)
+    before = torch.cuda.memory_allocated(device)
+    once(round_, device)
+    return torch.cuda.max_memory_allocated(device) - before
+
+
 def spread(samples: list[float]) -> dict[str, Any]:
     """Median, quartiles and least of some milliseconds, and all of them."""
     quarters = statistics.quantiles(samples, n=4, method="inclusive")
@@ -121,12 +129,16 @@ def compare(
             "difference": float((pictures[name] - pictures[first]).abs().double().mean()),
         }
         row = rows[name]
+        memory = ""
+        if device.type == "cuda":
+            row["peak_bytes"] = peak_bytes(ready[name], device)
+            memory = f"  peak {row['peak_bytes'] / 1e6:.0f} MB"
         say(
             f"{case!s:18} {name:14} forward {row['forward_ms']['median']:9.2f}  total "
             f"{row['total_ms']['median']:9.2f} ms (least {row['total_ms']['least']:.2f})  "
             f"{row[f'times_{first}']:7.2f} x {first} (least {row[f'times_{first}_least']:.2f}, "
             f"cores {row[f'times_{first}_cores']:.2f})  "
-            f"difference {row['difference']:.1e}"
+            f"difference {row['difference']:.1e}{memory}"
         )
     return list(rows.values())
 

@@ -26,6 +26,7 @@ from hoigs.core.model.camera_refinement import CameraRefinement, check_camera_gr
 from hoigs.core.model.objective import Weighted
 from hoigs.core.model.scene import SceneModel
 from hoigs.core.spec.train_schema import TrainSpec
+from hoigs.core.system.random_state import repeatable_convolutions
 from hoigs.core.system.threads import short_waits_when_busy
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.clip import Clip, Frame
@@ -230,6 +231,7 @@ class Trainer:
         return TimeWindows(self.model, self.optimizer, frames, self.spec.chunk, fixed, folder)
 
     @short_waits_when_busy()
+    @repeatable_convolutions()  # those of LPIPS
     def train(
         self, on_step: Callable[[StepReport], object] | None = None, *, until: int | None = None
     ) -> None:

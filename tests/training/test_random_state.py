@@ -9,7 +9,8 @@ import pytest
 import torch
 
 import hoigs as h
-from hoigs.core.system.random_state import callers_random_state
+from hoigs.core.system.random_state import callers_random_state, repeatable_convolutions
+from hoigs.metrics.lpips import lpips
 from hoigs.synthesis import SceneConfig, builtin_clip
 
 FEW = ["train.steps=1", "train.preview_every=0", "model.scene.points=20"]
@@ -54,3 +55,26 @@ def test_a_seed_decides_the_run_whatever_the_callers_state(tmp_path) -> None:
                       rasterizer="torch", device="cpu", evaluate=False)  # fmt: skip
         weights.append(run.session.trainer.model.entity("scene").means.detach())
     assert torch.equal(*weights)
+
+
+def test_training_has_repeatable_convolutions_and_the_caller_has_what_he_set(tmp_path) -> None:
+    folder = builtin_clip(h.AnnyBody(), SceneConfig.tiny())
+    seen = []
+    run = h.train(folder, "static", out=tmp_path / "run", overrides=FEW, rasterizer="torch",
+                  device="cpu", evaluate=False,
+                  on_step=lambda report: seen.append(torch.backends.cudnn.deterministic),
+    )  # fmt: skip
+    assert run is not None and seen == [True]
+    assert not torch.backends.cudnn.deterministic
+
+
+def test_the_gradient_of_lpips_repeats(device: torch.device) -> None:
+    image, target = (torch.rand(96, 96, 3, device=device) for _ in range(2))
+    image.requires_grad_()
+
+    def gradient() -> torch.Tensor:
+        return torch.autograd.grad(lpips(image, target), image)[0]
+
+    with repeatable_convolutions():
+        first = gradient()
+        assert all(torch.equal(gradient(), first) for _ in range(10))

@@ -7,7 +7,7 @@ On a GPU each small operation costs its launch, on a CPU its dispatch. The table
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import torch
@@ -56,25 +56,38 @@ def joint_transforms(
     transl: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch J 4 4"]:
     """As `skinning.joint_transforms`: the chain of each joint doubles in every round, which is 4
-    products for a body with hands, where one for each level of the tree would be 12."""
-    parents = tuple(parents)
-    rounds = _doubling_rounds(parents)
+    products for a body with hands, where one for each level of the tree would be 12.
+
+    Ancestors are chosen by products with zeros and ones: on CUDA the gradient of an index is summed
+    by atomics, in another order every time.
+    """
+    above, rounds = _choices(tuple(parents), rotations.dtype, rotations.device)
     joints = joints.expand(rotations.shape)
     # an extra joint with the identity transform stands before the root and is its parent
     bases = torch.cat((-transl[..., None, :], joints), -2)
-    above = constant(tuple(parent + 1 for parent in parents), joints, torch.long)
-    bones = joints - bases.index_select(-2, above)
+    bones = joints - above @ bases
     local = torch.cat((axis_angle_to_matrices(rotations), bones[..., None]), -1)
     last = constant((0.0, 0.0, 0.0, 1.0), local).expand(*local.shape[:-2], 1, 4)
     local = torch.cat((local, last), -2)
     none = constant(IDENTITY, local).expand(*local.shape[:-3], 1, 4, 4)
     world = torch.cat((none, local), -3)
-    for indices in rounds:
-        world = world.index_select(-3, constant(indices, world, torch.long)) @ world
+    for chosen in rounds:
+        world = (chosen @ world.flatten(-2)).unflatten(-1, (4, 4)) @ world
     top = world[..., 1:, :3, :]
     rotation, position = top[..., :3], top[..., 3]
     shift = position - (rotation @ joints[..., None])[..., 0]
     return torch.cat((torch.cat((rotation, shift[..., None]), -1), last), -2)
+
+
+@cache  # never freed, like `constant`
+def _choices(
+    parents: tuple[int, ...], dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, list[Tensor]]:
+    """Matrices that choose each joint's parent, and the ancestors of `_doubling_rounds`."""
+    with torch.inference_mode(False):
+        unit = torch.eye(len(parents) + 1, dtype=dtype, device=device)
+        rounds = [unit[list(indices)] for indices in _doubling_rounds(parents)]
+        return unit[[parent + 1 for parent in parents]], rounds
 
 
 @lru_cache(maxsize=32)

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from hoigs.core.device import replaceable
+from hoigs.core.maths.rows import added_rows, rows_of
 
 
 def nearest(
@@ -113,7 +114,8 @@ def mesh_roughness(values: Float[Tensor, "V D"], edges: Int[Tensor, "E 2"]) -> F
         edges: `mesh_edges` of the mesh.
     """
     # not bincount, which waits for the device to report how many bins there are
-    degree = values.new_zeros(len(values)).index_add(0, edges[:, 0], values.new_ones(len(edges)))
-    sums = torch.zeros_like(values).index_add(0, edges[:, 0], values[edges[:, 1]])
+    one, other = edges.unbind(1)
+    degree = added_rows(values.new_ones(len(edges)), one, len(values))
+    sums = added_rows(rows_of(values, other), one, len(values))
     means = torch.where(degree[:, None] > 0, sums / degree.clamp_min(1)[:, None], values)
     return (values - means).square().sum(-1).mean()

@@ -1,4 +1,4 @@
-"""The random state of the process, which belongs to the caller."""
+"""The random state of the process, which belongs to the caller, and repeatable gradients."""
 
 from __future__ import annotations
 
@@ -31,3 +31,17 @@ def callers_random_state() -> Iterator[None]:
             torch.cuda.set_rng_state_all(cuda)
         else:
             torch.cuda.manual_seed_all(seed)  # waits until CUDA is initialised, if it is not yet
+
+
+@contextmanager
+def repeatable_convolutions() -> Iterator[None]:
+    """cuDNN takes kernels whose gradients are the same bits every time; also a decorator.
+
+    It decides when a gradient is computed, so the block must contain that.
+    """
+    before = torch.backends.cudnn.deterministic
+    torch.backends.cudnn.deterministic = True
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.deterministic = before

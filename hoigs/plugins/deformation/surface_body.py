@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from hoigs.core.interfaces.body import HEAD_PART, PELVIS, BodySurface
 from hoigs.core.interfaces.deformation import Template
 from hoigs.core.maths.nearest import mesh_roughness, point_roughness
+from hoigs.core.maths.rows import rows_of
 from hoigs.core.maths.skinning import joint_turns, skin_gaussians
 from hoigs.core.values.gaussians import Gaussians
 from hoigs.core.values.moment import BodyPose, Moment, ResidualRule
@@ -132,7 +133,7 @@ class SurfaceBody(SkinnedBody):
         return self._changed(vertices) if self.reshaped(pose.betas, moment) else None
 
     def _changed(self, vertices: Float[Tensor, "V 3"]) -> Float[Tensor, "N 3"]:
-        corners = (vertices - self.rest_vertices)[self.body.faces[self.faces]]
+        corners = rows_of(vertices - self.rest_vertices, self.body.faces[self.faces])
         return (corners * self.barycentric[..., None]).sum(1)
 
     def posed(

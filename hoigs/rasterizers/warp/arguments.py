@@ -47,16 +47,27 @@ def project_arguments(inputs: Inputs, settings: Settings, out: Projected) -> lis
 
 
 class Gradients:
-    """What `kernels.project_adjoint` writes, in the shapes of the inputs."""
+    """What `kernels.project_adjoint` writes, in the shapes of the inputs.
 
-    def __init__(self, inputs: Inputs, pose: bool, absolute: bool, optics: bool = False) -> None:
+    Args:
+        pose, absolute, offsets: whether these are asked for; else theirs are empty.
+        optics: whether the camera has some.
+
+    Attributes:
+        sh: the largest, and the last that is written; the pipelines say where.
+    """
+
+    sh: Tensor
+
+    def __init__(
+        self, inputs: Inputs, pose: bool, absolute: bool, offsets: bool, optics: bool
+    ) -> None:
         self.means = torch.empty_like(inputs.means)
         self.quats = torch.empty_like(inputs.quats)
         self.log_scales = torch.empty_like(inputs.log_scales)
         self.opacity_logits = torch.empty_like(inputs.opacity_logits)
-        self.sh = torch.empty_like(inputs.sh)
         self.features = torch.empty_like(inputs.features) if inputs.channels else inputs.features
-        self.screen_offsets = inputs.means.new_empty(inputs.count, 2)
+        self.screen_offsets = inputs.means.new_empty(inputs.count if offsets else 0, 2)
         self.absolutes = inputs.means.new_empty(inputs.count if absolute else 0, ABSOLUTES)
         self.pose = inputs.means.new_empty(inputs.count if pose else 0, POSE)
         self.all_poses, self.motion = self.pose, None
@@ -92,27 +103,30 @@ class Gradients:
 def adjoint_arguments(
     inputs: Inputs,
     settings: Settings,
-    sh: Tensor,
-    active_bases: int,
+    bases: tuple[int, int],
     records: Tensor,
-    first_partial: Tensor,
     partial_counts: Tensor,
-    partials: Tensor,
+    partials: tuple[Tensor, Tensor] | None,
     out: Gradients,
 ) -> list[Any]:
     """Arguments of `kernels.project_adjoint` but for its last two, the range of Gaussians.
 
-    Of `sh` no bases are given where another kernel differentiates the colours.
+    Args:
+        bases: stored and active ones; none where another kernel has differentiated the colours.
+        partial_counts: of each Gaussian. partials: the index of the first of each, and themselves;
+            None where they have been summed (`gather_kernels`).
     """
+    first_partial, numbers = partials or (partial_counts, out.means)  # these are not read
     return [
-        *(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, sh),
-        *(sh.shape[1], active_bases, inputs.channels),
+        *(inputs.means, inputs.quats, inputs.log_scales, inputs.opacity_logits, inputs.sh),
+        *(*bases, inputs.channels),
         *(inputs.screen_offsets, int(inputs.screen_offsets.numel() > 0)),
         *(inputs.K, inputs.world_to_camera, settings.width, settings.height),
         *(settings.low_pass, int(settings.antialiased)),
-        *(records, first_partial, partial_counts, partials),
+        *(records, first_partial, partial_counts, int(partials is None), numbers),
         *(out.means, out.quats, out.log_scales, out.opacity_logits, out.sh),
-        *(out.screen_offsets, out.features, out.absolutes, ABSOLUTES * int(len(out.absolutes) > 0)),
+        *(out.screen_offsets, int(len(out.screen_offsets) > 0)),
+        *(out.features, out.absolutes, ABSOLUTES * int(len(out.absolutes) > 0)),
         *(out.all_poses, len(out.pose)),
     ]
 

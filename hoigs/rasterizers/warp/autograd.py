@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,12 +11,39 @@ from torch import Tensor
 from hoigs.core.first_order import first_order
 from hoigs.rasterizers.warp.frame import Images, Inputs, Settings, TileIntersections
 
+if TYPE_CHECKING:  # it loads Warp
+    from hoigs.rasterizers.warp.arguments import Projected
+
 INPUTS = len(fields(Inputs))
 
 
 def zeros(image: Tensor) -> Tensor:
     """A gradient for an image that has none; it is launched only where there are numbers."""
     return torch.zeros_like(image) if image.numel() else image
+
+
+class Drawn(NamedTuple):
+    """What the stages of a render have made."""
+
+    projected: Projected
+    tiles: TileIntersections
+    images: Images
+
+
+def draw(pipeline: Any, settings: Settings, inputs: Inputs) -> Drawn:
+    """All stages of a render, without gradients."""
+    with torch.no_grad(), torch.cuda.device_of(inputs.means):
+        projected = pipeline.project(inputs, settings)
+        tiles = pipeline.intersect(projected, settings)
+        return Drawn(projected, tiles, pipeline.blend(inputs, settings, projected.records, tiles))
+
+
+def render(pipeline: Any, settings: Settings, tensors: list[Tensor]) -> tuple[Tensor, ...]:
+    """Outputs of `Render`. They are drawn before autograd is told of them, which takes as long as
+    some of the kernels: on CUDA these then run meanwhile."""
+    drawn = draw(pipeline, settings, Inputs(*tensors))
+    outputs: tuple[Tensor, ...] = Render.apply(pipeline, settings, drawn, *tensors)
+    return outputs
 
 
 class Render(torch.autograd.Function):
@@ -28,13 +55,9 @@ class Render(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, pipeline: Any, settings: Settings, *tensors: Tensor
+        ctx: Any, pipeline: Any, settings: Settings, drawn: Drawn, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        inputs = Inputs(*tensors)
-        with torch.cuda.device_of(inputs.means):
-            projected = pipeline.project(inputs, settings)
-            tiles = pipeline.intersect(projected, settings)
-            images = pipeline.blend(inputs, settings, projected.records, tiles)
+        projected, tiles, images = drawn
         ctx.pipeline, ctx.settings = pipeline, settings
         ctx.tiling = (tiles.tile_height, tiles.tiles_x, tiles.tiles_y)
         ctx.save_for_backward(
@@ -61,13 +84,13 @@ class Render(torch.autograd.Function):
                 for image, x in zip(saved[4:], upstream)
             )
         )
-        needs = Inputs(*ctx.needs_input_grad[2:])
+        needs = Inputs(*ctx.needs_input_grad[3:])
         with torch.cuda.device_of(inputs.means):
             moving = bool(needs.K) and ctx.settings.optics
             pose = bool(needs.world_to_camera) or moving
             out = ctx.pipeline.gradients(
                 inputs, ctx.settings, records, intersections, images, v, pose,
-                bool(needs.absolute_gradients),
+                bool(needs.absolute_gradients), bool(needs.screen_offsets),
             )  # fmt: skip
         background = None
         if needs.background:
@@ -88,4 +111,4 @@ class Render(torch.autograd.Function):
             subset=None,
             absolute_gradients=out.absolutes if needs.absolute_gradients else None,
         )
-        return (None, None, *vars(gradients).values())
+        return (None, None, None, *vars(gradients).values())

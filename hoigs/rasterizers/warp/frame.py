@@ -47,7 +47,7 @@ class Inputs:
 
     Attributes:
         means [N, 3], quats [N, 4], log_scales [N, 3], opacity_logits [N], sh [N, K, 3]: raw space.
-        features [N, F]; screen_offsets [N, 2] pixels; subset [N] uint8.
+        features [N, F], absent [0, 0]; screen_offsets [N, 2] pixels; subset [N] uint8.
         absolute_gradients [N, 2]: receives them; its values are not read.
         background: [3] or [H, W, 3].
         world_to_camera [4, 4], K [3, 3]: of the camera; with optics the pose in the middle of the
@@ -169,10 +169,12 @@ class InputValidation:
         """
         optics = getattr(camera, "optics", None)
         plain = camera if optics is None else replace(camera, optics=None)
-        key = tuple(
-            (x.shape, x.dtype, x.device) if isinstance(x, Tensor) else x
-            for value in (gaussians, plain, request)
-            for x in getattr(value, "__dict__", {}).values()  # the check names other types
+        key: tuple[Any, ...] = tuple(
+            [  # not a generator, which takes half as long again
+                (x.shape, x.dtype, x.device) if isinstance(x, Tensor) else x
+                for value in (gaussians, plain, request)
+                for x in getattr(value, "__dict__", {}).values()  # the check names other types
+            ]
         )
         if optics is not None:
             pose = optics.last_world_to_camera
@@ -216,7 +218,7 @@ def _tensors(gaussians: Gaussians, camera: Camera, request: RenderRequest) -> li
         gaussians.log_scales,
         gaussians.opacity_logits,
         gaussians.sh,
-        like.new_empty(like.shape[0], 0) if features is None else features,
+        _constant(like.device, 0, 0) if features is None else features,
         _constant(like.device, 0, 2) if offsets is None else offsets,
         _black(like) if background is None else background,
         pose,

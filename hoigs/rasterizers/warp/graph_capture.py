@@ -13,6 +13,7 @@ from hoigs.core.fast.graphs import capturing
 from hoigs.core.interfaces.rasterizer import RenderOutput, RenderRequest
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
+from hoigs.rasterizers.warp.autograd import draw
 from hoigs.rasterizers.warp.frame import Inputs, Settings
 
 Prepare = Callable[[Gaussians, Camera, RenderRequest], tuple[Settings, list[Tensor]]]
@@ -118,10 +119,7 @@ class CapturedRender:
 
     def _draw(self) -> tuple[RenderOutput, int]:
         """The output, and for how many intersections there was memory."""
-        inputs = Inputs(*self._buffers)
-        projected = self._pipeline.project(inputs, self._settings)
-        tiles = self._pipeline.intersect(projected, self._settings)
-        images = self._pipeline.blend(inputs, self._settings, projected.records, tiles)
+        projected, tiles, images = draw(self._pipeline, self._settings, Inputs(*self._buffers))
         info = {name: getattr(projected, name) for name in ("radii", "means2d", "depths")}
         features = None if self._request.features is None else images.features
         return RenderOutput(images.color, images.alpha, images.depth, features, info), tiles.count

@@ -18,7 +18,7 @@ from hoigs.core.interfaces.rasterizer import (
 )
 from hoigs.core.values.camera import Camera
 from hoigs.core.values.gaussians import Gaussians
-from hoigs.rasterizers.warp.autograd import Render
+from hoigs.rasterizers.warp.autograd import render
 from hoigs.rasterizers.warp.frame import InputValidation
 from hoigs.rasterizers.warp.graph_capture import CapturedRender
 
@@ -40,6 +40,9 @@ class WarpConfig(ComponentConfig):
     """CPU cores to use; torch.get_num_threads() when None."""
 
 
+DEFAULT = RenderRequest()
+
+
 class WarpRasterizer(Rasterizer):
     """Draws by the rules of `hoigs.core.maths.projection`, in float32, with its own backward.
 
@@ -53,9 +56,10 @@ class WarpRasterizer(Rasterizer):
     number so far. A view that exceeds it is still drawn right, with the same picture, but some
     times slower, its gradients are summed in no fixed order, and the next one allocates more (after
     two such views, where Gaussians are many). A render holds 20 bytes for each intersection (12 of
-    them until it is drawn), its backward 4 (10 + feature channels) more, and 92 bytes for each
-    Gaussian, gradients apart. Steps can be captured in a CUDA graph after a first one; `capture`
-    does that for rendering.
+    them until it is drawn) and 92 for each Gaussian. Until they are summed, its backward holds 4
+    (10 + feature channels) more for each intersection, where possible in the memory of the colours'
+    gradient. Steps can be captured in a CUDA graph after a first one; `capture` does that for
+    rendering.
 
     From 262,144 Gaussians and 48 for each 128 pixels on, the nearest sixth is drawn first. Of the
     others, only those are taken, and counted as intersections, that meet a tile where some pixel is
@@ -86,11 +90,11 @@ class WarpRasterizer(Rasterizer):
     def render(
         self, gaussians: Gaussians, camera: Camera, request: RenderRequest | None = None
     ) -> RenderOutput:
-        request = request or RenderRequest()
+        request = request or DEFAULT
         settings, tensors = self.inputs.prepare(gaussians, camera, request)
         pipeline = self.pipeline(gaussians.means.device)
-        *images, means2d, depths, radii = Render.apply(pipeline, settings, *tensors)
-        color, alpha, depth, features = images
+        color, alpha, depth, features, *seen = render(pipeline, settings, tensors)
+        means2d, depths, radii = seen
         info = {"radii": radii, "means2d": means2d, "depths": depths}
         return RenderOutput(
             color, alpha, depth, None if request.features is None else features, info
@@ -122,7 +126,7 @@ class WarpRasterizer(Rasterizer):
             self.inputs.prepare,
             gaussians,
             camera,
-            request or RenderRequest(),
+            request or DEFAULT,
         )
 
     def graph_memory(self, device: torch.device) -> int:

@@ -11,18 +11,19 @@ BLOCK = 256  # threads
 ROWS = BLOCK  # Gaussians of a block
 BLOCK_C = wp.constant(BLOCK)
 
-# The sums of a row's partials, in the place of the first of them, always in the same order. Those
-# that were not written, most where much is hidden, are not read. A warp takes `wide` of their
-# numbers at a time, so lanes form groups, three where there are no features. A group adds up a row;
-# where a row has more partials, the groups of a warp share it, and where it has very many, those of
-# the block.
+# The sums of a row's partials, always in the same order. They are put where the gradients of the
+# same Gaussian will be, and wait there for the adjoint: so they take no memory of their own, and
+# that of the partials is free. Partials that were not written, most where much is hidden, are not
+# read. A warp takes `wide` of their numbers at a time, so lanes form groups, three where there are
+# no features. A group adds up a row; where a row has more partials, the groups of a warp share it,
+# and where it has very many, those of the block.
 _GATHER = r"""
     constexpr int WARPS = %(BLOCK)d / 32, ROWS = %(ROWS)d;
     constexpr int FEW = 48, MANY = 512, AHEAD = 8;
     const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
     const int* first_partial_ = (const int*)first_partial.data;
     const int* tiles_per_gaussian_ = (const int*)tiles_per_gaussian.data;
-    float* partials_ = (float*)partials.data;
+    const float* partials_ = (const float*)partials.data;
     const unsigned char* written_ = (const unsigned char*)written.data;
     int* drawn_ = (int*)drawn.data;
     __shared__ int listed, taken, rows_listed[ROWS];
@@ -52,6 +53,17 @@ _GATHER = r"""
     for (int c = 0; c < stride; c += 32) {
         const int wide = stride - c < 32 ? stride - c : 32, groups = 32 / wide;
         const int group = lane / wide, column = c + lane - group * wide;
+        float* to;  // the sum of this column, of the first row, and how many numbers a row has
+        int width;
+        if (column < 3) { to = (float*)v_means.data + column; width = 3; }
+        else if (column < 6) { to = (float*)v_quats.data + column - 3; width = 4; }
+        else if (column < 9) { to = (float*)v_log_scales.data + column - 6; width = 3; }
+        else if (column == 9) { to = (float*)v_quats.data + 3; width = 4; }
+        else if (column < 10 + channels) {
+            to = (float*)v_features.data + column - 10;
+            width = channels;
+        } else { to = (float*)v_absolutes.data + column - 10 - channels; width = 2; }
+        auto put = [&](int of, float total) { to[(long long)of * width] = total; };
         // every `step`-th of n partials from `at` on; AHEAD loads are in flight together
         auto sum = [&](int at, int n, int step, bool& some) -> float {
             const float* from = partials_ + (long long)at * stride + column;
@@ -89,19 +101,19 @@ _GATHER = r"""
             unsigned long long bits = __shfl_sync(0xffffffffu, own_bits, source & 31);
             const int at = __shfl_sync(0xffffffffu, own_first, source & 31);
             if (source < 0) continue;
-            float* to = partials_ + (long long)at * stride + column;
+            const float* from = partials_ + (long long)at * stride + column;
             float total = 0.0f;
             while (bits != 0) {
                 float values[AHEAD];
                 #pragma unroll
                 for (int j = 0; j < AHEAD; ++j) {
-                    values[j] = bits != 0 ? to[(long long)(__ffsll(bits) - 1) * stride] : 0.0f;
+                    values[j] = bits != 0 ? from[(long long)(__ffsll(bits) - 1) * stride] : 0.0f;
                     bits &= bits - 1;
                 }
                 #pragma unroll
                 for (int j = 0; j < AHEAD; ++j) total += values[j];
             }
-            *to = total;
+            put(row - lane + source, total);
         }
         if (threadIdx.x == 0) taken = 0;
         __syncthreads();
@@ -110,17 +122,17 @@ _GATHER = r"""
             if (lane == 0) k = atomicAdd(&taken, 1);
             k = __shfl_sync(0xffffffffu, k, 0);
             if (k >= listed) break;
-            const int n = tiles_per_gaussian_[rows_listed[k]], at = first_partial_[rows_listed[k]];
+            const int of = rows_listed[k], n = tiles_per_gaussian_[of], at = first_partial_[of];
             if (n > MANY) continue;
             bool some = false;
             const float mine = group < groups ? sum(at + group, n - group, groups, some) : 0.0f;
             const float total = sum_of_groups(mine);
-            some = __any_sync(0xffffffffu, some);  // all have read
-            if (group == 0 && some) partials_[(long long)at * stride + column] = total;
-            if (lane == 0 && c == 0) drawn_[rows_listed[k]] = some;
+            some = __any_sync(0xffffffffu, some);
+            if (group == 0 && some) put(of, total);
+            if (lane == 0 && c == 0) drawn_[of] = some;
         }
         for (int k = 0; k < listed; ++k) {  // all warps together
-            const int n = tiles_per_gaussian_[rows_listed[k]], at = first_partial_[rows_listed[k]];
+            const int of = rows_listed[k], n = tiles_per_gaussian_[of], at = first_partial_[of];
             if (n <= MANY) continue;
             const int begin = warp * groups + group;
             bool some = false;
@@ -131,9 +143,9 @@ _GATHER = r"""
             if (warp == 0 && group == 0 && some) {
                 float total = 0.0f;
                 for (int w = 0; w < WARPS; ++w) total += parts[w][lane];
-                partials_[(long long)at * stride + column] = total;
+                put(of, total);
             }
-            if (threadIdx.x == 0 && c == 0) drawn_[rows_listed[k]] = some;
+            if (threadIdx.x == 0 && c == 0) drawn_[of] = some;
             __syncthreads();
         }
         __syncthreads();
@@ -143,8 +155,9 @@ _GATHER = r"""
 
 @wp.func_native(_GATHER % {"BLOCK": BLOCK, "ROWS": ROWS})
 def gather_native(
-    block: int, count: int, stride: int, first_partial: I32, tiles_per_gaussian: I32,
-    written: U8, partials: F32, drawn: I32,
+    block: int, count: int, stride: int, channels: int, first_partial: I32, tiles_per_gaussian: I32,
+    written: U8, partials: F32, v_means: F32, v_quats: F32, v_log_scales: F32, v_features: F32,
+    v_absolutes: F32, drawn: I32,
 ): ...  # fmt: skip
 
 
@@ -152,15 +165,22 @@ def gather_native(
 def gather_partials(
     count: int,  # N; a block for each ROWS of them
     stride: int,
+    channels: int,
     first_partial: I32,
     tiles_per_gaussian: I32,
     written: U8,  # [intersections] 1 where a partial was written
-    partials: F32,  # the first of each Gaussian becomes the sum of those of its own that were
-    drawn: I32,  # [N] 1 where there is one, else 0
+    partials: F32,
+    # of a Gaussian with partials that were written, their sums
+    v_means: F32,  # [N, 3] M_G, M_U, M_Y
+    v_quats: F32,  # [N, 4] M_UU, M_UY, M_YY, depth
+    v_log_scales: F32,  # [N, 3] M_RED and the next
+    v_features: F32,  # [N, channels] themselves
+    v_absolutes: F32,  # [N, ABSOLUTES] themselves, where the partials have them
+    drawn: I32,  # [N] 1 where there are some, else 0
 ):
     gather_native(
-        wp.tid() // BLOCK_C, count, stride, first_partial, tiles_per_gaussian, written, partials,
-        drawn,
+        wp.tid() // BLOCK_C, count, stride, channels, first_partial, tiles_per_gaussian, written,
+        partials, v_means, v_quats, v_log_scales, v_features, v_absolutes, drawn,
     )  # fmt: skip
 
 

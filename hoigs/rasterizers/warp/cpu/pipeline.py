@@ -85,9 +85,11 @@ class CpuPipeline(ABC):
         upstream: Images,
         pose: bool,
         absolute: bool,
+        offsets: bool,
     ) -> Gradients:
-        """Of all inputs; of the pose, and absolute ones, where they are asked for."""
-        out = Gradients(inputs, pose, absolute, settings.optics)
+        """Of all inputs; of the pose and the offsets, and absolute ones, where asked for."""
+        out = Gradients(inputs, pose, absolute, offsets, settings.optics)
+        out.sh = torch.empty_like(inputs.sh)
         count, stride = intersections.count, MOMENTS + inputs.channels + ABSOLUTES * absolute
         check_addressable(count * stride, f"{count} tile intersections")
         partials = inputs.means.new_zeros(count, stride)
@@ -95,10 +97,11 @@ class CpuPipeline(ABC):
         arguments += [*upstream_arguments(upstream, partials), *self.further[1]]
         kernel = self.absolute_kernel if absolute else self.backward_kernel
         self._tiles(kernel, intersections, arguments)
-        of_gaussian = [intersections.first_partial, intersections.tiles_per_gaussian]
+        bases = inputs.sh.shape[1], settings.active_bases
         arguments = adjoint_arguments(
-            inputs, settings, inputs.sh, settings.active_bases, records, *of_gaussian, partials, out
-        )
+            inputs, settings, bases, records, intersections.tiles_per_gaussian,
+            (intersections.first_partial, partials), out,
+        )  # fmt: skip
         kernel = (optics if settings.optics else pinhole).project_adjoint
         self.cores.each(kernel, inputs.count, arguments)
         return out

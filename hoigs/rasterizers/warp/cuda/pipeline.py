@@ -85,13 +85,18 @@ class CudaPipeline:
         upstream: Images,
         pose: bool,
         absolute: bool,
+        offsets: bool,
     ) -> Gradients:
-        """Of all inputs; of the pose, and absolute ones, where they are asked for."""
+        """Of all inputs; of the pose and the offsets, and absolute ones, where asked for."""
         stream, count = self.streams.current(self.device), inputs.count
         stride = MOMENTS + inputs.channels + ABSOLUTES * absolute
         capacity, tiles = intersections.count, intersections.tiles
         check_addressable(capacity * stride, f"{capacity} tile intersections")
-        partials = inputs.means.new_empty(capacity, stride)
+        # until they are summed, the partials are where the largest of the gradients will be, if
+        # they fit there; else their memory is free again before that is allocated
+        fit = capacity * stride <= inputs.sh.numel()
+        size = inputs.sh.shape if fit else (capacity, stride)
+        partials = inputs.means.new_empty(size)
         words = -(-capacity // 16)
         written = partials.new_empty(16 * words, dtype=torch.uint8)
         arguments = [count, stride, tiles, intersections.offsets, written, partials]
@@ -103,23 +108,26 @@ class CudaPipeline:
         stream.each(kernel, lanes, arguments, TILE_BLOCK)
 
         # allocated while the device is at the pixels
-        out = Gradients(inputs, pose, absolute, settings.optics)
-        first, drawn = intersections.first_partial, torch.empty_like(intersections.first_partial)
-        of_gaussian = [first, intersections.tiles_per_gaussian]
-        arguments = [count, stride, *of_gaussian, written, partials, drawn]
+        out = Gradients(inputs, pose, absolute, offsets, settings.optics)
+        drawn = torch.empty_like(intersections.first_partial)
+        arguments = [
+            *(count, stride, inputs.channels, intersections.first_partial),
+            *(intersections.tiles_per_gaussian, written, partials),
+            *(out.means, out.quats, out.log_scales, out.features, out.absolutes, drawn),
+        ]
         blocks = -(-count // gather_kernels.ROWS)
         stream.blocks(gather_kernels.gather_partials, blocks, gather_kernels.BLOCK, arguments)
-        apart = settings.active_bases > 1  # the adjoint of harmonics is a kernel of its own
-        sh, active_bases = (inputs.sh[:, :0], 0) if apart else (inputs.sh, settings.active_bases)
-        arguments = adjoint_arguments(
-            inputs, settings, sh, active_bases, records, first, drawn, partials, out
-        )
-        stream.each((optics if settings.optics else pinhole).project_adjoint, count, arguments)
-        if apart:
+        sh = partials if fit else None
+        del partials, written, arguments
+        out.sh = torch.empty_like(inputs.sh) if sh is None else sh
+        bases = inputs.sh.shape[1], settings.active_bases
+        if settings.active_bases > 1:  # the adjoint of harmonics is a kernel of its own
             arguments = [
-                *(inputs.means, inputs.sh, inputs.sh.shape[1], settings.active_bases),
-                *(inputs.world_to_camera, records, first, drawn, partials, stride),
-                *(out.sh, out.means, out.pose, int(pose), count),
+                *(inputs.means, inputs.sh, *bases, inputs.world_to_camera, records, drawn),
+                *(out.log_scales, out.sh, count),
             ]
             stream.blocks(harmonics_adjoint, -(-count // SH_BLOCK), SH_BLOCK, arguments)
+            bases = 0, 0
+        arguments = adjoint_arguments(inputs, settings, bases, records, drawn, None, out)
+        stream.each((optics if settings.optics else pinhole).project_adjoint, count, arguments)
         return out

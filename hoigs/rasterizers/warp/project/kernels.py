@@ -205,13 +205,18 @@ def make_kernels(module, onto_screen, is_regular, shape_adjoint):
 
     def project_adjoint(
         means: VEC3, quats: VEC4, log_scales: VEC3, opacity_logits: F32, sh: VEC3,
-        stored_bases: int, active_bases: int, channels: int, offsets: F32, has_offsets: int,
+        stored_bases: int,  # 0, both, after `harmonics_adjoint`: v_sh is there, and in v_log_scales
+        active_bases: int,  # stands the gradient of the camera centre in place of the colour's
+        channels: int, offsets: F32, has_offsets: int,
         K: F32, world_to_camera: F32, width: int, height: int, low_pass: float, antialiased: int,
         records: F32,
         first_partial: I32,  # index in `partials` of a Gaussian's first
         partial_counts: I32,  # how many it has
+        summed: int,  # 1 where their sums stand where `gather_kernels` puts them instead
         partials: F32, v_means: VEC3, v_quats: VEC4, v_log_scales: VEC3, v_opacity_logits: F32,
-        v_sh: VEC3, v_offsets: F32, v_features: F32, v_absolutes: F32,
+        v_sh: VEC3,
+        v_offsets: F32,  # empty where not asked for
+        wants_offsets: int, v_features: F32, v_absolutes: F32,
         absolutes: int,  # how many numbers v_absolutes has of each Gaussian: 0 or 2
         v_pose: F32,  # empty when the pose needs no gradient
         has_pose: int,  # 0, or how many rows v_pose has
@@ -221,22 +226,25 @@ def make_kernels(module, onto_screen, is_regular, shape_adjoint):
         if row >= count:
             return
         stride = MOMENTS_C + channels + absolutes
-        begin = first_partial[row] * stride
         partial_count = partial_counts[row]
-        zero3 = wp.vec3(0.0, 0.0, 0.0)
-        for k in range(channels):
-            total = float(0.0)
-            for j in range(partial_count):
-                total += partials[begin + j * stride + MOMENTS_C + k]
-            v_features[row * channels + k] = total
-        for k in range(absolutes):
-            total = float(0.0)
-            for j in range(partial_count):
-                total += partials[begin + j * stride + MOMENTS_C + channels + k]
-            v_absolutes[row * absolutes + k] = total
+        begin = 0
+        if summed == 0:
+            begin = first_partial[row] * stride
+        if summed == 0 or partial_count == 0:
+            for k in range(channels):
+                total = float(0.0)
+                for j in range(partial_count):
+                    total += partials[begin + j * stride + MOMENTS_C + k]
+                v_features[row * channels + k] = total
+            for k in range(absolutes):
+                total = float(0.0)
+                for j in range(partial_count):
+                    total += partials[begin + j * stride + MOMENTS_C + channels + k]
+                v_absolutes[row * absolutes + k] = total
         if has_pose != 0:
             for k in range(POSE_C):
                 v_pose[row * POSE_C + k] = 0.0
+        zero3 = wp.vec3(0.0, 0.0, 0.0)
         if partial_count == 0:
             for k in range(stored_bases):
                 v_sh[row * stored_bases + k] = zero3
@@ -244,8 +252,9 @@ def make_kernels(module, onto_screen, is_regular, shape_adjoint):
             v_quats[row] = wp.vec4(0.0, 0.0, 0.0, 0.0)
             v_log_scales[row] = zero3
             v_opacity_logits[row] = 0.0
-            v_offsets[2 * row] = 0.0
-            v_offsets[2 * row + 1] = 0.0
+            if wants_offsets != 0:
+                v_offsets[2 * row] = 0.0
+                v_offsets[2 * row + 1] = 0.0
             return
 
         g = float(0.0)
@@ -256,18 +265,30 @@ def make_kernels(module, onto_screen, is_regular, shape_adjoint):
         gyy = float(0.0)
         v_color = wp.vec3(0.0, 0.0, 0.0)
         v_depth = float(0.0)
-        for j in range(partial_count):
-            p = begin + j * stride
-            g += partials[p + M_G]
-            gu += partials[p + M_U]
-            gy += partials[p + M_Y]
-            guu += partials[p + M_UU]
-            guy += partials[p + M_UY]
-            gyy += partials[p + M_YY]
-            v_color += wp.vec3(
-                partials[p + M_RED], partials[p + M_RED + 1], partials[p + M_RED + 2]
-            )
-            v_depth += partials[p + M_RED + 3]
+        if summed != 0:
+            first = v_means[row]
+            second = v_quats[row]
+            g = first[0]
+            gu = first[1]
+            gy = first[2]
+            guu = second[0]
+            guy = second[1]
+            gyy = second[2]
+            v_color = v_log_scales[row]
+            v_depth = second[3]
+        else:
+            for j in range(partial_count):
+                p = begin + j * stride
+                g += partials[p + M_G]
+                gu += partials[p + M_U]
+                gy += partials[p + M_Y]
+                guu += partials[p + M_UU]
+                guy += partials[p + M_UY]
+                gyy += partials[p + M_YY]
+                v_color += wp.vec3(
+                    partials[p + M_RED], partials[p + M_RED + 1], partials[p + M_RED + 2]
+                )
+                v_depth += partials[p + M_RED + 3]
 
         mean = means[row]
         quat = quats[row]
@@ -297,29 +318,32 @@ def make_kernels(module, onto_screen, is_regular, shape_adjoint):
             v_xy, v_yy, v_pose, has_pose, row,
         )  # fmt: skip
 
-        for k in range(3):
-            if not learns(records[row * RECORD_C + RED + k]):
-                v_color[k] = 0.0
-        for k in range(active_bases, stored_bases):
-            v_sh[row * stored_bases + k] = zero3
-        v_center = wp.vec3(0.0, 0.0, 0.0)
-        if active_bases > 1:
-            toward = mean - camera_center(world_to_camera)
-            distance = wp.length(toward)
-            direction = toward / distance
-            v_direction = sh_color_adjoint(
-                sh, row, stored_bases, active_bases, direction, v_color, v_sh
-            )
-            v_center = (wp.dot(direction, v_direction) * direction - v_direction) / distance
-        else:
-            sh_color_adjoint(sh, row, stored_bases, active_bases, zero3, v_color, v_sh)
+        v_center = v_color  # after `harmonics_adjoint`
+        if active_bases > 0:
+            for k in range(3):
+                if not learns(records[row * RECORD_C + RED + k]):
+                    v_color[k] = 0.0
+            for k in range(active_bases, stored_bases):
+                v_sh[row * stored_bases + k] = zero3
+            v_center = zero3
+            if active_bases > 1:
+                toward = mean - camera_center(world_to_camera)
+                distance = wp.length(toward)
+                direction = toward / distance
+                v_direction = sh_color_adjoint(
+                    sh, row, stored_bases, active_bases, direction, v_color, v_sh
+                )
+                v_center = (wp.dot(direction, v_direction) * direction - v_direction) / distance
+            else:
+                sh_color_adjoint(sh, row, stored_bases, active_bases, zero3, v_color, v_sh)
 
         v_means[row] = raw.mean - v_center
         v_quats[row] = raw.quat
         v_log_scales[row] = raw.log_scale
         v_opacity_logits[row] = g / (1.0 + wp.exp(opacity_logits[row]))
-        v_offsets[2 * row] = v_u
-        v_offsets[2 * row + 1] = v_v
+        if wants_offsets != 0:
+            v_offsets[2 * row] = v_u
+            v_offsets[2 * row + 1] = v_v
         if has_pose != 0:
             p = row * POSE_C
             for k in range(3):

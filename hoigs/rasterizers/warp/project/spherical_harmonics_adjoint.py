@@ -16,14 +16,13 @@ from hoigs.rasterizers.warp.project.spherical_harmonics import (
     sh_basis,
     sh_direction_gradient,
 )
-from hoigs.rasterizers.warp.records import F32, I32, M_RED, POSE, RECORD, RED, VEC3
+from hoigs.rasterizers.warp.records import F32, I32, RECORD, RED, VEC3
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 16})
 
 BLOCK = 128
 _ROW = 49  # numbers that a row of the buffer takes: odd, so that rows start in different banks
 RECORD_C = wp.constant(RECORD)
-POSE_C = wp.constant(POSE)
 
 # A warp's rows as they lie in memory, `width` numbers each. Where SPARSE of them or fewer have a
 # gradient, those are moved one by one; else all numbers are walked: `i` in the array, and `at` in
@@ -99,12 +98,9 @@ def harmonics_adjoint(
     stored_bases: int,
     active_bases: int,  # more than 1
     world_to_camera: F32, records: F32,
-    first_partial: I32,  # index in `partials` of the sums of a Gaussian
-    drawn: I32,  # 1 where a Gaussian has partials, else 0
-    partials: F32, stride: int, v_sh: F32,
-    v_means: VEC3,  # the part that goes through the viewing direction is added
-    v_pose: F32,  # its camera centre is written
-    has_pose: int,
+    drawn: I32,  # 1 where a Gaussian has a gradient, else 0
+    colors: VEC3,  # of the colour; becomes that of the camera centre through the viewing direction
+    v_sh: F32,
     count: int,  # N; the launch is rounded up to whole blocks
 ):  # fmt: skip
     row = wp.tid()
@@ -115,10 +111,10 @@ def harmonics_adjoint(
     load_rows(sh, buffer, row, count, 3 * stored_bases, visible)
     if visible:
         v_color = wp.vec3(0.0, 0.0, 0.0)
-        p = first_partial[row] * stride + M_RED
+        given = colors[row]
         for j in range(3):
             if learns(records[row * RECORD_C + RED + j]):
-                v_color[j] = partials[p + j]
+                v_color[j] = given[j]
         toward = means[row] - camera_center(world_to_camera)
         distance = wp.length(toward)
         direction = toward / distance
@@ -132,11 +128,7 @@ def harmonics_adjoint(
                     + get(buffer, 3 * k + 2) * v_color[2]
                 )
         v_direction = sh_direction_gradient(direction, dots, active_bases)
-        v_center = (wp.dot(direction, v_direction) * direction - v_direction) / distance
-        v_means[row] = v_means[row] - v_center
-        if has_pose != 0:
-            for j in range(3):
-                v_pose[row * POSE_C + 12 + j] = v_center[j]
+        colors[row] = (wp.dot(direction, v_direction) * direction - v_direction) / distance
         for k in range(16):
             if k < stored_bases:
                 for j in range(3):
