@@ -27,7 +27,13 @@ from hoigs.preparation.objects.make_object import MadeObject
 from hoigs.preparation.options import PrepareOptions
 from hoigs.preparation.people import Body
 from hoigs.preparation.report.measures import BodyWithin
-from hoigs.preparation.report.object_seen import ObjectSeen, best_click, by_state
+from hoigs.preparation.report.object_seen import (
+    DOUBTFUL,
+    SEEN,
+    ObjectSeen,
+    best_click,
+    by_state,
+)
 from hoigs.preparation.report.overlay import OverlayVideo, save_object_picture, several, shown_frame
 from hoigs.preparation.report.report import PrepareReport
 from hoigs.preparation.upright import world_of
@@ -150,6 +156,7 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
     first = measures.pop(
         options.object_name, {"object_observed": None, "object_scale_spread": None}
     )
+    seen = _objects_seen(draft, options)
     return PrepareReport(
         name=name,
         video=draft.source.video.name,
@@ -187,7 +194,7 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
             for name, one in draft.bodies.items()
         },
         provenance=draft.provenance,
-        warnings=list(draft.warnings),
+        warnings=[*draft.warnings, *(s.doubt(name) for name, s in seen.items() if s.unexplained)],
         unknown=draft.unknown,
         seconds=draft.seconds,
         registered=figures["registered"] / figures["images"] if "registered" in figures else None,
@@ -213,7 +220,7 @@ def _report(draft: Draft, options: PrepareOptions, name: str, world: World) -> P
         **first,
         object_name=options.object_name,
         further_objects=measures,
-        objects_seen=_objects_seen(draft, options),
+        objects_seen=seen,
         omega=angular_factor(draft.cameras, middle_of_motion, draft.video.fps),
         big_omega=full_factor(draft.cameras, moving),
     )
@@ -248,9 +255,11 @@ def _objects_seen(draft: Draft, options: PrepareOptions) -> dict[str, ObjectSeen
             continue
         rows = list(draft.track.positions)
         states, sure = [found.states[i] for i in rows], found.confidence[rows].tolist()
-        seen[name] = replace(
-            seen[name], states=by_state(states), click=best_click(states, sure, draft.video.indices)
-        )
+        seen[name] = replace(seen[name], proposed=bool(found.boxes))
+        if seen[name].unexplained:
+            states = [DOUBTFUL if state == SEEN else state for state in states]
+        click = best_click(states, sure, draft.video.indices)
+        seen[name] = replace(seen[name], states=by_state(states), click=click)
     return seen
 
 

@@ -35,6 +35,7 @@ SMALLEST = 3.0  # pixels of the radius, median
 FEWEST, FEWEST_EDGES = 8, 12  # frames; edges of pixels along the outline
 SPILLS = 0.5  # of the ball's part that nothing hides, to lie outside its mask
 SHOWN, ENOUGH = 0.6, 0.35  # of the circle: to judge by it; to find the centre by it
+SECTORS = 20  # of a circle
 TOUCHES = 0.09  # metres in the image from a joint to the ball's outline, at the joint's distance
 ALONG = (0.25, 0.5, 0.75, 1.0)  # of a bone, where it is looked at
 FLESH = 0.05  # metres about a bone
@@ -105,6 +106,8 @@ def ball_cones(masks: MaskStack, humans: MaskStack, cameras: Sequence[Camera]) -
             off[i] = spilled
         if off[i] <= 2 * MOSTLY and angle < 1:
             found[i] = *direction, angle
+        if off[i] <= MOSTLY and _around(rays[i], direction) < SHOWN:
+            off[i] = np.nan  # an arc, such as the border of the picture leaves, proves no circle
     known = np.isfinite(found[:, 3])
     if int(known.sum()) < FEWEST:
         raise NoBallError(f"{int(known.sum())} frames show it round, and {FEWEST} are needed")
@@ -121,6 +124,10 @@ def require_round(cones: Cones, cameras: Sequence[Camera]) -> None:
     """NoBallError where the outlines are not all circles, which says what they are."""
     focal = float(np.median([float(c.focal.mean()) for c in cameras]))
     across = float(np.median(cones.angles)) * focal
+    if len(cones.judged) < FEWEST:
+        raise NoBallError(
+            f"{len(cones.judged)} frames show most of its circle, and {FEWEST} are needed"
+        )
     median, most = np.median(cones.judged), np.quantile(cones.judged, 0.8)
     if across < SMALLEST:
         raise NoBallError(f"it is {2 * across:.0f} pixels across")
@@ -228,6 +235,13 @@ def fit_cone(
 def _angles(rays: Float[np.ndarray, "N 3"], axis: Float[np.ndarray, " 3"]) -> np.ndarray:
     """Small ones stay exact, unlike those of arccos."""
     return np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=-1), rays @ axis)
+
+
+def _around(rays: Float[np.ndarray, "N 3"], axis: Float[np.ndarray, " 3"]) -> float:
+    """The share of a circle about an axis that has rays."""
+    u, v = (rays @ np.linalg.svd(axis[None])[2][1:].T).T
+    sectors = np.floor((np.arctan2(v, u) / (2 * np.pi) + 0.5) * SECTORS).astype(int)
+    return len(np.unique(sectors % SECTORS)) / SECTORS
 
 
 def outline_rays(xy: Float[np.ndarray, "N 2"], camera: Camera) -> Float[np.ndarray, "N 3"]:

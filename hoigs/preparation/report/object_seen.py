@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from itertools import groupby
 
 SEEN = "seen"  # `EntityMasks.states` of a frame whose mask is verified
-UNKNOWN = ("lost", "doubtful")  # of a frame in which a click may help
-DOUBTFUL = 0.5  # agreement of a verified frame's cues below which a click there helps
+DOUBTFUL = "doubtful"  # of one whose mask may be of something else
+UNKNOWN = ("lost", DOUBTFUL)  # of a frame in which a click may help
+UNSURE = 0.5  # agreement of a verified frame's cues below which a click there helps
+EXPLAINED = 0.6  # overlap with one thing that moves, from which a proposal counts as seen
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,7 @@ class ObjectSeen:
         place_m: metres by which its place is off from frame to frame, typically.
         turn_degrees: by which its rotation is off, typically; None: its turn cannot be seen.
         overlap: intersection over union of its outline and its masks, mean; None: not seen.
+        proposed: whether nothing was clicked.
     """
 
     states: dict[str, list[int]] = field(default_factory=dict)
@@ -29,12 +32,27 @@ class ObjectSeen:
     place_m: float | None = None
     turn_degrees: float | None = None
     overlap: float | None = None
+    proposed: bool = False
 
     @property
     def share(self) -> float | None:
         """The part of the frames in which it is seen."""
         count = sum(map(len, self.states.values()))
         return len(self.states.get(SEEN, [])) / count if count else None
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether nobody clicked it, and nothing that moves as one has its masks: a limb, clothes
+        or a part of the scene rather than a thing."""
+        return self.proposed and self.overlap is not None and self.overlap < EXPLAINED
+
+    def doubt(self, name: str) -> str:
+        """What to say of one that is unexplained."""
+        return (
+            f"{name}: nothing was clicked, and nothing that moves as one explains what was taken "
+            f"(IoU of its outline {self.overlap:.2f}): it may be a limb, clothes or a part of the "
+            "scene, and no mask of it counts as seen; click on the object"
+        )
 
     @property
     def unseen(self) -> str:
@@ -79,7 +97,7 @@ def best_click(
         count = f"{len(longest)} frames" if len(longest) > 1 else "a frame"
         return numbers[middle], f"the middle of {count} in which it is {state}, if it is in view"
     seen = [(confidence[i], i) for i, state in enumerate(states) if state == SEEN]
-    if seen and min(seen)[0] < DOUBTFUL:
+    if seen and min(seen)[0] < UNSURE:
         return numbers[min(seen)[1]], "it is seen there with most doubt"
     return None
 

@@ -133,3 +133,11 @@ def test_limbs_give_the_radius_and_the_rotation_stays_unknown() -> None:
     torch.testing.assert_close(
         made.track.points.norm(dim=-1), torch.full((200,), found[0]), atol=1e-5, rtol=0
     )
+
+
+def test_the_arc_that_the_border_of_the_picture_leaves_proves_no_ball() -> None:
+    """The tip of a surfboard at the lower edge of the picture was a ball of 0.8 m."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    tips = MaskStack((x - WIDTH / 2) ** 2 + (y - HEIGHT - 30) ** 2 < 50**2 for _ in CAMERAS)
+    with pytest.raises(NoBallError, match="most of its circle"):
+        require_round(ball_cones(tips, NOBODY, CAMERAS), CAMERAS)
