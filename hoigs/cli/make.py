@@ -100,7 +100,7 @@ def _announce(plan: EstimatorPlan) -> None:
     frames = "" if plan.frames is None else f" for {plan.frames} frames"
     if frames and not plan.counted:
         frames = f" for at most {plan.frames} frames, by the video's header"
-    title = f"plan{frames}, with the time that each step takes on 2 cores"
+    title = f"plan{frames}, with times of 2 cores, longer where the camera moves"
     if plan.choices:
         print_table(title, ("what", "from", "why", "about"), plan.rows(), widest=80)
     for note in plan.notes:

@@ -19,16 +19,16 @@ from hoigs.preparation.video.container import video_header
 from hoigs.preparation.video.source import MEGASAM, VGGT, Source, numbered_frames
 from hoigs.preparation.video.span import Span
 
-# seconds of a processor a frame of 1280x720, about, as benchmarks/prepare_alone.py measures them;
-# those of networks are guesses
+# seconds a frame of 1280x720 on two cores, about, as reports of real videos say (`seconds`); up to
+# three times as long before a camera that moves; those of networks are guesses
 COST = {
-    "estimator:mediapipe": 0.15,
-    "estimator:object-tracker": 0.45,
+    "estimator:mediapipe": 0.3,
+    "estimator:object-tracker": 0.8,
     "estimator:transformers-sam2": 4.0,
     "estimator:transformers-pose": 0.6,
     "estimator:transformers-depth": 1.5,
 }
-STAGES_COST = 0.35  # of all other stages, likewise
+STAGES_COST = 0.8  # of all other stages, likewise
 WHAT: dict[Place, str] = {
     "landmarks": "person's landmarks",
     "masks": "person's mask",
