@@ -37,16 +37,9 @@ CAMERAS = ("cam02", "cam03", "cam04")  # cam01 sees no elbows
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=SHARED / "data/fourviews")
-    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=CAMERAS)
-    parser.add_argument("--keep", type=Path, help="folder in which clips and their work stay")
+    parser = parser_of(__doc__)
     parser.add_argument("--pictures", type=Path, help="folder for the body in others' frames")
-    parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    if not args.data.is_dir():
-        print(f"there is no {args.data}: set HOIGS_SHARED to the folder that holds data/")
-        return 1
     with tempfile.TemporaryDirectory() as temporary:
         folder = (args.keep or Path(temporary)).absolute()
         folder.mkdir(parents=True, exist_ok=True)
@@ -60,6 +53,25 @@ def main() -> int:
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1) + "\n")
     return 0
+
+
+def parser_of(text: str) -> argparse.ArgumentParser:
+    """Options of what is measured on the recording, described by the first line of a text."""
+    parser = argparse.ArgumentParser(description=text.splitlines()[0])
+    parser.add_argument("--data", type=recording, default=str(SHARED / "data/fourviews"))
+    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=CAMERAS)
+    parser.add_argument("--keep", type=Path, help="folder in which clips and their work stay")
+    parser.add_argument("--json", type=Path)
+    return parser
+
+
+def recording(text: str) -> Path:
+    """Its folder, which has to be there."""
+    if not Path(text).is_dir():
+        raise argparse.ArgumentTypeError(
+            f"there is no {text}: set HOIGS_SHARED to the folder that holds data/"
+        )
+    return Path(text)
 
 
 def measured(data: Path, camera: str, folder: Path) -> dict[str, Any]:

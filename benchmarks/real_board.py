@@ -10,12 +10,11 @@ are known); `wander_mm` is what is left without the constant part, such as the m
 part of the board; `turn_deg` is the mean of the rotation's error after one constant turn, as the
 clip's axes of the object are its own. `seen` counts those of these frames that the clip calls seen.
 `said_mm` and `said_deg` are what the clip's report says, and `within` the share of the frames in
-which the centre is as near as that.
+which the centre is as near as that. Clips that are in the `--keep` folder are used again.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -24,19 +23,11 @@ from typing import Any
 
 import clicks
 import numpy as np
-from real import CAMERAS, SHARED, table, true_view
+from real import parser_of, table, true_view
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=SHARED / "data/fourviews")
-    parser.add_argument("--cameras", nargs="+", choices=CAMERAS, default=CAMERAS)
-    parser.add_argument("--keep", type=Path, help="folder in which clips stay and are used again")
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    if not args.data.is_dir():
-        print(f"there is no {args.data}: set HOIGS_SHARED to the folder that holds data/")
-        return 1
+    args = parser_of(__doc__).parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = (args.keep or Path(temporary)).absolute()
         rows = {camera: measured(args.data, camera, folder) for camera in args.cameras}

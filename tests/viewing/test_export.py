@@ -28,7 +28,7 @@ def test_a_file_and_what_was_kept_beside_it(hoigs, tmp_path):
     sheet = json.loads((tmp_path / "x.ply.json").read_text())
     assert sheet["frames"] == [5.5] and sheet["units"] == "metres" and "OpenCV" in sheet["axes"]
     assert sheet["entities"] == {"scene": "scene", "human": "human", "object": "object"}
-    assert "scales" in sheet["kept"] and "whose a Gaussian is" in sheet["lost"]
+    assert "scales" in sheet["kept"] and "the Gaussians' entities" in sheet["lost"]
     again = hoigs("export", tiny_run(), "--format", "ply", "--out", tmp_path / "x.ply")
     assert again.code == 2 and "exists and is not replaced" in again.err
 

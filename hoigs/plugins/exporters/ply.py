@@ -125,7 +125,9 @@ class PlyExporter(TurnedExporter):
         data = ply_bytes(move.gaussians(state.joined()), pad_sh=self.config.pad_sh)
         progress(0.5, "writing")
         (folder / "scene.ply").write_bytes(data)
-        lost = {"whose a Gaussian is": "all are one list; --entities exports those of one entity"}
+        lost = {
+            "the Gaussians' entities": "all are one list; --entities exports those of one entity"
+        }
         if len(request.entities) < 2:
             lost = {}
         if len(request.moments) > 1:
@@ -172,5 +174,7 @@ class PlySequenceExporter(TurnedExporter):
                 data = ply_bytes(move.gaussians(gaussians), pad_sh=self.config.pad_sh)
                 (folder / name / f"frame_{i:04d}.ply").write_bytes(data)
         if self.config.merged and len(request.entities) > 1:
-            return {"whose a Gaussian is": "all are one list; --set merged=false keeps them apart"}
+            return {
+                "the Gaussians' entities": "all are one list; --set merged=false keeps them apart"
+            }
         return {}

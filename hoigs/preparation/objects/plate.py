@@ -145,7 +145,8 @@ def plate_object(
         provenance=(
             f"a flat thing: the picture of frame {crops.frames[row]} laid over the others as a "
             f"plane's; rotation known in {int(sure.sum())} of {len(shown)} frames, the others "
-            f"follow their neighbours; its size by {by}; its outline is what most frames show of it"
+            "follow their neighbours, and where they have a mask, it and the hands place them; "
+            f"its size by {by}; its outline is what most frames show of it"
         ),
     )
     confidence = ObjectConfidence(

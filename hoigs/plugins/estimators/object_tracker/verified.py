@@ -301,6 +301,7 @@ def _continued(
                     break
                 if i in kept:
                     continue
+                # where looks end, once: what motion does not lead to from there, it never does
                 if abs(i - last) == 1 and last not in kept and not follows(i, last, speed):
                     kept = carried_on(proven[0], end, step)
                     found[kept] = True
@@ -314,7 +315,8 @@ def _continued(
                     found[half] = True
                     proven, half = (last, speed), []
             else:
-                found[carried_on(proven[0], end, step) if half else []] = True
+                if half:
+                    found[carried_on(proven[0], end, step)] = True
     return found
 
 
