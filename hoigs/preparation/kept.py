@@ -62,7 +62,7 @@ PLAN = {
         version=5,
     ),
     "object_masks": Stage(
-        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=10
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=11
     ),
     "cameras": Stage(
         3,

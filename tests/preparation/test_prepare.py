@@ -28,7 +28,7 @@ from hoigs.preparation.video.frames import VideoFrames
 from hoigs.preparation.video.pictures import Picture
 from hoigs.preparation.video.source import SourceError
 
-QUICK = {"fit_steps": 30, "overlay_width": 0}  # what is tested here is not the fit
+QUICK = {"fit_steps": 5, "overlay_width": 0}  # what is tested here is not the fit
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_borders_of_a_distorted_video_are_kept_if_asked(
 ) -> None:
     """Of a lens with barrel distortion, the undistorted image is larger than the frame."""
     intrinsics = (60.0, 60.0, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, -0.15, 0.0, 0.0, 0.0)
-    options = {"intrinsics": intrinsics, "camera": "static"}
+    options = {"intrinsics": intrinsics, "camera": "static", "fit_steps": 3}
     cut, _ = prepared(tiny_source, tmp_path / "cut", body, **options)
     clip, report = prepared(tiny_source, tmp_path / "whole", body, keep_borders=True, **options)
     small, large = cut.cameras[0], clip.cameras[0]

@@ -193,7 +193,7 @@ class ClickMasks:
 
     def _made(self, frame: int) -> _Still:
         if self._still_scene is not None:
-            beside = (frame - BESIDE, frame, frame + BESIDE)
+            beside = sorted({frame, *(frame + way * n for n, _ in BESIDE for way in (-1, 1))})
             footage = self._read([n for n in beside if 0 <= n < self.video.count])
             scene = replace(self._still_scene, footage=footage)
             return _Still.of(footage, scene, footage.numbers.index(frame))

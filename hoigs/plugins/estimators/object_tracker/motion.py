@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -11,10 +12,13 @@ from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 
-BESIDE, FARTHEST = 2, 6  # frames before and after: of these the nearest that the footage has
+# Frames before and after: of each span the nearest that the footage has. What is held still for a
+# moment moves with the hand that holds it, and what is printed on a thing always does.
+BESIDE = ((2, 5), (6, 9), (10, 14))
 REACH = 9  # quarters of its pixels that a pixel may move between: 36 pixels
 LARGEST = 40.0  # difference of colours from which pixels differ entirely
 SAME = (1.4, 2.0)  # a motion explains a pixel up to so much of its own best cost, and more
+FOUND = 8.0  # mean difference of colours up to which a mask is found again; at twice it is not
 INVERTED = 3  # steps by which a motion is inverted: it is nearly a translation
 RIM = 0.12  # breadth of the surroundings of a mask, of the root of its area
 
@@ -37,22 +41,23 @@ class Motion:
     def of(cls, footage: Footage, i: int) -> Motion:
         """None of the frames beside it where the footage does not have them."""
         here, number, beside = _halved(footage.colors(i)), footage.numbers[i], []
-        for way in (-1, 1):
+        for way, (first, last) in product((-1, 1), BESIDE):
             apart = [(way * (n - number), k) for k, n in enumerate(footage.numbers)]
-            near = min((a for a in apart if BESIDE <= a[0] <= FARTHEST), default=None)
+            near = min((a for a in apart if first <= a[0] <= last), default=None)
             if near is not None:
                 there = _halved(footage.colors(near[1]))
                 shift = _shifts(here, there)
                 beside.append((there, shift, _costs(here, there, shift, 3)))
         return cls(here, beside)
 
-    def sets_off(self, mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "2"]:
-        """How much better one affine motion explains a mask than what is around it.
+    def sets_off(self, mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "K 3"]:
+        """How much better one affine motion explains a mask than what is around it, to each of the
+        frames beside it.
 
         Returns:
             The share of the mask that it explains less that of its surroundings; and how much worse
-            than each pixel's own shift it does in these than in the mask, as logarithm. Zeros where
-            nothing is known.
+            than each pixel's own shift it does in these than in the mask, as logarithm; and how far
+            the mask is found again by it, 0 to 1.
         """
         rows, columns = self.here.shape[:2]
         cut = mask[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2)
@@ -65,9 +70,10 @@ class Motion:
             cost = _costs(self.here, there, np.rint(_affine(small, shift)).astype(int), 3)
             fits, worse = cost < SAME[0] * least + SAME[1], np.log1p(np.maximum(cost - least, 0))
             found.append((
-                fits[small].mean() - fits[around].mean(), worse[around].mean() - worse[small].mean()
+                fits[small].mean() - fits[around].mean(), worse[around].mean() - worse[small].mean(),
+                np.clip(2 - cost[small].mean() / FOUND, 0, 1),
             ))  # fmt: skip
-        return np.mean(found, 0) if found else np.zeros(2)
+        return np.array(found).reshape(-1, 3)
 
 
 def moved_on(

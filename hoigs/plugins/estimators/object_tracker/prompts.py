@@ -70,9 +70,9 @@ COMMON = 2.0  # times that a colour may be more frequent on a person than along 
 UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the scene
 SCENE = 4.0  # units of noise up to which they look as the scene does
 BESIDE = 0.1  # of a mask on a person: what looks like the scene beside them counts from there on
+MOVING = np.array((0.3, 0.5))  # most that one frame says: a part of what turns is set off, too
 # of `_Judge.features`: the last by 143 clicks anywhere, the others by 83
 WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 3.0)
-MOVING = np.array((0.3, 0.5))  # most that motion says: a part of what turns is set off, too
 POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
@@ -207,11 +207,18 @@ class _Judge:
             np.log(np.maximum(self.quality(tried), POOR)),
             np.zeros(len(masks)) if part is None else np.log(np.array(taken) + 1e-3),
             [self._of_limbs(m, bins) for m in masks],
-            *np.clip([self.motion.sets_off(m) for m in masks], -MOVING, MOVING).T,
+            *np.stack([self._moves_alone(m) for m in masks], -1),
             (alike.sum(1) - 1) / max(len(masks) - 1, 1),
             np.log(area),
             np.log([min(1 - self._of_scene(m) + BESIDE, 1) for m in masks]),
         ), -1)  # fmt: skip
+
+    def _moves_alone(self, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
+        """How much one motion sets a mask off, the mean over the frames beside it, of which those
+        in which it is not found again say nothing; zeros where there are none."""
+        rows = self.motion.sets_off(mask)
+        said = rows[:, :2].clip(-MOVING, MOVING) * rows[:, 2:]
+        return said.mean(0) if len(said) else np.zeros(2)
 
     def _of_scene(self, mask: Bool[np.ndarray, "h w"]) -> float:
         """The share of a mask, grown from a click on a person, that is beside them and looks as the
