@@ -18,7 +18,7 @@ BESIDE = ((2, 5), (6, 9), (10, 14))
 REACH = 9  # quarters of its pixels that a pixel may move between: 36 pixels
 LARGEST = 40.0  # difference of colours from which pixels differ entirely
 SAME = (1.4, 2.0)  # a motion explains a pixel up to so much of its own best cost, and more
-FOUND = 8.0  # mean difference of colours up to which a mask is found again; at twice it is not
+FOUND = 7.0  # mean difference of colours up to which a mask is found again; at twice it is not
 INVERTED = 3  # steps by which a motion is inverted: it is nearly a translation
 RIM = 0.12  # breadth of the surroundings of a mask, of the root of its area
 
