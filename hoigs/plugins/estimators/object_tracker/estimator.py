@@ -52,6 +52,7 @@ from hoigs.plugins.estimators.object_tracker.states import (
     SEEN,
     covers_torso,
     is_worn,
+    looks_like_skin,
     mostly_doubtful,
     states_of,
 )
@@ -138,6 +139,10 @@ CLOTHES = (
 SHIRT = (
     "what was taken covers one person's torso and hardly reaches beyond it: that is rather their "
     "clothes, and is dropped; click on the object"
+)
+SKIN = (
+    "what was taken has the colours of people's faces and hands: that is rather a bare arm or leg, "
+    "and is dropped; click on the object"
 )
 EQUAL = (
     "other things look the same, so that only its path tells which is which; where it does not, "
@@ -259,14 +264,19 @@ class ObjectTrackerEstimator(Estimator):
         vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
         taken = {n: t.soft > 127 for n, t in tracks.items() if n in chosen and t is not None}
         shirts = [n for n, m in taken.items() if n not in vague and covers_torso(m, people)]
-        tracks |= dict.fromkeys((*vague, *shirts))
+        bare = [
+            n
+            for n, m in taken.items()
+            if n not in (*vague, *shirts) and looks_like_skin(footage, m, people)
+        ]
+        tracks |= dict.fromkeys((*vague, *shirts, *bare))
         states = states_of(footage, tracks)
         worn = [n for n, t in tracks.items() if n in chosen and t and is_worn(t.soft > 127, people)]
         clicked = [n for n, m in prompts.items() if m and n not in chosen]
         faint = [n for n in clicked if all(_looks_like_scenery(scene, p) for p in prompts[n])]
         scenery = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
         states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *scenery)}
-        why = ((vague, VAGUE), (shirts, SHIRT), (worn, CLOTHES))
+        why = ((vague, VAGUE), (shirts, SHIRT), (bare, SKIN), (worn, CLOTHES))
         said = [f"{n}: {reason}" for names, reason in why for n in names]
         notes += [*alike, *said, *doubts(tracks, footage)]
         write_tracks(file, video, footage, tracks, Said(chosen, notes, states))

@@ -69,10 +69,9 @@ class Motion:
         for there, shift, least in self.beside if small.any() and around.any() else ():
             cost = _costs(self.here, there, np.rint(_affine(small, shift)).astype(int), 3)
             fits, worse = cost < SAME[0] * least + SAME[1], np.log1p(np.maximum(cost - least, 0))
-            found.append((
-                fits[small].mean() - fits[around].mean(), worse[around].mean() - worse[small].mean(),
-                np.clip(2 - cost[small].mean() / FOUND, 0, 1),
-            ))  # fmt: skip
+            again = np.clip(2 - cost[small].mean() / FOUND, 0, 1)
+            apart = [of[small].mean() - of[around].mean() for of in (fits, -worse)]
+            found.append((*apart, again))
         return np.array(found).reshape(-1, 3)
 
 

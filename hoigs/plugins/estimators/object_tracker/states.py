@@ -9,12 +9,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from hoigs.plugins.estimators.object_tracker.footage import (
+    SAMPLED,
     SLEEVES,
     TORSO,
     TRUNK,
     Footage,
+    bins_of,
+    histogram,
     limbs,
     torso_length,
+    usual_torso,
+)
+from hoigs.plugins.estimators.object_tracker.footage import (
+    SEEN as VISIBLE,
 )
 from hoigs.plugins.estimators.object_tracker.path import center_of
 from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, lies_on_people
@@ -24,6 +31,9 @@ SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a per
 DOUBTFUL = "doubtful"  # there is a mask, and it may be a part of a person or of the scene
 WORN, FEWEST = 0.9, 5  # share of a mask, and of the frames, that are clothes; frames that say so
 CLOTHED, COVERS = 0.85, 0.35  # share of a shirt that torso and sleeves hold, and of the torso
+BARE = (0, 9, 10, 15, 16, 19, 20)  # landmarks of face and hands
+AROUND = 0.07  # torsos about these that are skin
+LIKE_SKIN = 0.72  # likeness of colours from which a thing is rather skin
 RIM = 2  # pixels from the edge of the picture within which a mask reaches it
 RECENT = 8  # frames before it was seen last that say how it moved
 BEYOND = 0.5  # of what was seen of it last: what has less left in the picture is out of it
@@ -109,6 +119,34 @@ def covers_torso(
         if len(within) >= FEWEST and np.mean(within) > CLOTHED and np.mean(covered) > COVERS:
             return True
     return False
+
+
+def looks_like_skin(
+    footage: Footage,
+    masks: Bool[np.ndarray, "F h w"],
+    people: Sequence[Float[np.ndarray, "F 33 4"]],
+) -> bool:
+    """Whether an object has the colours of people's faces and hands over the video: rather a bare
+    arm or leg, whose landmarks are wrong. False where nobody's skin or size is known.
+
+    Args:
+        masks: of the object. people: landmarks of each person, pixels and visibility.
+    """
+    reach, shown = AROUND * usual_torso(people), np.flatnonzero(masks.any((1, 2))).tolist()
+    if not np.isfinite(reach) or not shown:
+        return False
+    y, x = np.mgrid[: masks.shape[1], : masks.shape[2]] + 0.5
+    skin = []
+    for i in np.unique(np.linspace(0, len(masks) - 1, 2 * SAMPLED).astype(int)).tolist():
+        places = [p[i, k, :2] for p in people for k in BARE if p[i, k, 3] > VISIBLE]
+        near = [np.hypot(x - at[0], y - at[1]) < reach for at in places]
+        bare = np.any(near, axis=0) & footage.person[i] & ~masks[i]
+        skin += [histogram(bins_of(footage.colors(i)), bare * 1.0)] if bare.any() else []
+    if not skin:
+        return False
+    usual = np.sqrt(np.mean(skin, 0))
+    own = [histogram(bins_of(footage.colors(i)), masks[i] * 1.0) for i in shown]
+    return float(np.median(np.sqrt(own) @ usual)) > LIKE_SKIN
 
 
 def _left(masks: Bool[np.ndarray, "F h w"], seen: Int[np.ndarray, " S"], i: int) -> bool:

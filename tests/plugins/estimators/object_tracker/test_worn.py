@@ -1,10 +1,17 @@
-"""What is proposed and covers a torso is clothes; what is held before one is not."""
+"""What is proposed and covers a torso is clothes, and what has the colours of skin a limb."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from disc_world import texture
+from test_behind import footage_of
 
-from hoigs.plugins.estimators.object_tracker.states import covers_torso, is_worn
+from hoigs.plugins.estimators.object_tracker.states import (
+    covers_torso,
+    is_worn,
+    looks_like_skin,
+)
 
 FRAMES, SIDE = 8, 120
 
@@ -43,3 +50,22 @@ def test_a_torso_that_is_not_seen_says_nothing() -> None:
     hidden = someone()
     hidden[:, 23:25, 3] = 0
     assert not covers_torso(box(42, 26, 78, 84), [hidden])
+
+
+@pytest.mark.parametrize(("color", "skin"), [((205, 150, 125), True), ((150, 110, 60), False)])
+def test_a_bare_leg_is_told_from_a_thing_by_face_and_hands(
+    color: tuple[int, int, int], skin: bool
+) -> None:
+    frame = texture(0, (90, 110, 150), (SIDE, SIDE))
+    leg, marks = box(60, 70, 90, 110), someone()
+    marks[:, (0, 15, 16)] = ((60, 20, 0, 1), (100, 60, 0, 1), (20, 60, 0, 1))
+    y, x = np.mgrid[:SIDE, :SIDE]
+    for at in marks[0, (0, 15, 16), :2]:
+        near = np.hypot(x - at[0], y - at[1]) < 6
+        frame[near] = texture(1, (205, 150, 125), (SIDE, SIDE))[near]
+    frame[leg[0]] = texture(2, color, (SIDE, SIDE))[leg[0]]
+    person = np.ones((SIDE, SIDE), bool)
+    seen = footage_of([frame.astype(np.uint8)] * FRAMES, [person] * FRAMES)
+    assert looks_like_skin(seen, leg, [marks]) == skin
+    marks[..., 3] = 0  # nobody's face or hands are seen
+    assert not looks_like_skin(seen, leg, [marks])
