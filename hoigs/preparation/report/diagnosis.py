@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from hoigs.core.reporting import Diagnostic, Severity, ranges
 from hoigs.preparation.report.measures import BodyWithin, Measures
-from hoigs.preparation.report.object_seen import SEEN
+from hoigs.preparation.report.object_seen import OUT, SEEN
 
 AGREES = 0.5  # correlation of textures from which the object's rotation is trusted
 COVERED = 0.5  # of the frames: with landmarks in fewer, the body is not good, however near to them
@@ -129,6 +129,8 @@ def _up(report: Measures) -> Iterator[MeasureDiagnostic]:
 
 def _frames(report: Measures) -> Iterator[MeasureDiagnostic]:
     for name, coverage in report.coverage.items():
+        if name in report.objects_seen and report.objects_seen[name].states:
+            continue  # `_objects_seen` says what its empty frames are
         empty = sum(value == 0 for value in coverage) / max(1, len(coverage))
         mean = sum(coverage) / max(1, len(coverage))
         yield _judged(
@@ -291,13 +293,16 @@ def _objects_seen(report: Measures) -> Iterator[MeasureDiagnostic]:
     for name, seen in report.objects_seen.items():
         if seen.share is None:
             continue
+        severity = _judge(seen.missed, 0.1, 0.4)
+        if severity == "good" and OUT in seen.states:
+            severity = "fair"  # that it is out follows from how it moved, and is not seen
         shown = set(seen.states.get(SEEN, []))
         advice = seen.advice or "nothing can be done where it is hidden or out of the picture"
         one = _judged(
             f"{name} seen",
             f"{100 * seen.share:.0f} % of the frames",
             f"verified: its looks, size and way agree there; {seen.unseen}",
-            _judge(1 - seen.share, 0.1, 0.4),
+            severity,
             f"{advice} (--object {name}=X,Y@FRAME)" if seen.advice else advice,
         )
         yield replace(one, frames=tuple(i for i in range(report.frames) if i not in shown))
@@ -329,11 +334,12 @@ def _object_judged(report: Measures) -> Iterator[MeasureDiagnostic]:
     if report.object_way != "texture and hands":
         return
     known = [v for v in report.object_agreement if v is not None]
-    trusted = sum(v >= AGREES for v in known) / max(1, len(report.object_agreement))
+    shown = sum(v is not None for v in report.object_iou)
+    trusted = sum(v >= AGREES for v in known) / max(1, shown)
     middle = sorted(known)[len(known) // 2] if known else 0.0
     yield _judged(
         "object's rotation",
-        f"{100 * trusted:.0f} % of the frames",
+        f"{100 * trusted:.0f} % of the frames that show it",
         f"its texture agrees there with that of other frames (correlation {middle:.2f}, median); "
         f"worst in {_worst(report.object_agreement)}",
         _judge(1 - trusted, 0.1, 0.3),

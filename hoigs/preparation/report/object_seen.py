@@ -8,6 +8,7 @@ from itertools import groupby
 
 SEEN = "seen"  # `EntityMasks.states` of a frame whose mask is verified
 DOUBTFUL = "doubtful"  # of one whose mask may be of something else
+OUT = "out of the picture"  # of one that it left, or had not come into, as it moved
 UNKNOWN = ("lost", DOUBTFUL)  # of a frame in which a click may help
 UNSURE = 0.5  # agreement of a verified frame's cues below which a click there helps
 EXPLAINED = 0.6  # overlap with one thing that moves, from which a proposal counts as seen
@@ -39,6 +40,13 @@ class ObjectSeen:
         """The part of the frames in which it is seen."""
         count = sum(map(len, self.states.values()))
         return len(self.states.get(SEEN, [])) / count if count else None
+
+    @property
+    def missed(self) -> float:
+        """The part of the frames in which it is not seen, of those that it is not out of; 1 of one
+        that is seen nowhere."""
+        in_view = sum(len(frames) for state, frames in self.states.items() if state != OUT)
+        return 1 - len(self.states.get(SEEN, [])) / max(in_view, 1)
 
     @property
     def unexplained(self) -> bool:

@@ -61,6 +61,20 @@ def test_an_object_that_is_seen_in_few_frames_is_bad_and_its_other_frames_are_na
 
 
 @pytest.mark.parametrize(
+    ("states", "severity"),
+    [
+        (["out of the picture"] * 6 + ["seen"] * 4, "fair"),
+        (["out of the picture"] * 4 + ["lost"] * 3 + ["seen"] * 3, "bad"),
+        (["out of the picture"] * 10, "bad"),
+    ],
+)
+def test_what_is_out_of_the_picture_is_not_missed(states: list[str], severity: str) -> None:
+    seen = {"club": ObjectSeen(by_state(states))}
+    found = replace(report(), frames=10, objects_seen=seen, coverage={"club": [0.0] * 10})
+    assert [d.severity for d in found.diagnostics() if "club" in d.kind] == [severity]
+
+
+@pytest.mark.parametrize(
     ("boxes", "overlap", "states"),
     [
         ([(3, 0, 0, 9, 9)], 0.5, {"doubtful": [0, 1, 3], "lost": [2]}),
