@@ -37,7 +37,8 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.reporting import Progress, no_progress, ranges
 from hoigs.core.system.files import written_whole
 from hoigs.plugins.estimators import steady_masks
-from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import LOST, REPAIRED
+from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import GONE, LOST, REPAIRED
+from hoigs.plugins.estimators.mediapipe.one_person import someone_else
 from hoigs.plugins.estimators.tools import HEAVY, MEDIAPIPE, run_tool, settings_key
 
 # Masks of people from the bits that `mediapipe_script.py` wrote.
@@ -195,6 +196,9 @@ class MediapipeEstimator(Estimator):
         clicked = chosen is not None
         looked = None if clicked else self._by_looks(video, given, progress)
         out, found = looked or self._found(order, chosen, video, given, progress)
+        led_away: tuple[str, ...] = ()
+        if not clicked and not looked:
+            out, found, led_away = self._of_one(out, found, video, given, progress)
         progress(1.0, "landmarks")
         text = f"MediaPipe Pose, complexity {self._complexity()}"
         text += ", of whoever was chosen" if clicked else ""
@@ -223,7 +227,7 @@ class MediapipeEstimator(Estimator):
         if not clicked:
             empty = ~found["person"][0].any((1, 2))
             notes += _without_pose(found["alone"], empty, given, video.numbers)
-        notes += _changed(np.atleast_1d(changed.any(0)), given, video.numbers)
+        notes += led_away + _changed(np.atleast_1d(changed.any(0)), given, video.numbers)
         return Estimates(EntityMasks(masks, None, text, notes=notes), landmarks)
 
     def _found(
@@ -266,6 +270,42 @@ class MediapipeEstimator(Estimator):
             for place, _, x, y, side in rows.tolist()
         ]
         return (out, found) if np.mean(there) >= CERTAIN else None
+
+    def _of_one(
+        self, out: Path, found: dict[str, np.ndarray], video: VideoRequest, given: range,
+        progress: Progress,
+    ) -> tuple[Path, dict[str, np.ndarray], tuple[str, ...]]:  # fmt: skip
+        """What was found of the person whom most frames show, where MediaPipe's own way led to
+        others: they are followed as if they had been clicked on; if that shows less of them, the
+        frames of others are left out. And what there is to say of it."""
+        image = found["image_xyzv"][0]
+        other = someone_else(image)
+        if not other.any():
+            return out, found, ()
+        own = np.flatnonzero(np.isfinite(image[:, 0, 0]) & ~other)
+        i = int(own[len(own) // 2])
+        low, high = image[i, :, :2].min(0), image[i, :, :2].max(0)
+        low, high = low.clip(0), high.clip(max=(video.width, video.height))
+        human = EntityRequest("human", "human", box=(*low, *high), frame=given[i])
+        x, y = image[i, HIPS, :2].mean(0)
+        said = (
+            f"MediaPipe went over to other people in {int(other.sum())} of {len(given)} frames; "
+            f"the one at {x:.0f},{y:.0f} in frame {given[i]}, whom most frames show, was followed "
+            "(--person X,Y@FRAME chooses another)",
+        )
+        order, chosen = _order(given, replace(video, entities=(human,)))
+        try:
+            again, followed = self._found(order, chosen, video, given, progress)
+        except PromptError:
+            followed = found
+        seen = np.isfinite(followed["image_xyzv"][0][:, 0, 0])
+        if followed is not found and seen[own].mean() >= FOLLOWED:
+            return again, followed, said
+        for name, nothing in (("image_xyzv", np.nan), ("world_xyzv", np.nan), ("person", 0)):
+            if name in found:  # masks are not always asked for
+                found[name][0][other] = nothing
+        found["fate"][0][other] = GONE
+        return out, found, said
 
     def people(self, video: VideoRequest) -> tuple[FramePrompt, ...]:
         rows, shown = self._looks(video)
