@@ -79,7 +79,7 @@ PLAN = {
     ),
     "masks": Stage(10, ("people", "object_masks"), ("keep_black",), slow=True, version=3),
     "objects": Stage(
-        40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=7
+        40, ("masks",), ("ball_radius", "object_points", "object_track"), slow=True, version=8
     ),
     "scene": Stage(10, ("masks",), ("prompts", "scene_points", "backdrop"), slow=True, version=2),
     "write": Stage(40, ("objects", "scene")),

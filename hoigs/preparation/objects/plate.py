@@ -298,23 +298,30 @@ def refined(
 
 def held_size(seen: Watched, planes: Planes) -> tuple[float, float, str]:
     """What to enlarge all by, so that the plane goes through the hands at it; what that is off by,
-    relative: half of the middle 68 % of what they say, and a grip's width; and by what it is."""
+    relative: half of the middle 68 % of what they say, and a grip's width; and by what it is.
+
+    A plane whose tilt is off is too near at one hand and too far at the other: where both hold it,
+    they count as one.
+    """
     crops, hands, joints = seen.crops, seen.hands, seen.filmed.joints
     normals = (planes.rotations @ planes.normals[0])[0]
-    found = []
+    found, both = list[float](), list[float]()
     for i, frame in enumerate(crops.frames.tolist()):
         near = hands.near[frame]
         if joints is None or not near.any():
             continue
         grips = seen.filmed.cameras[frame].to_camera(_grips(joints[frame])[torch.from_numpy(near)])
         on = (normals[i] @ planes.places[0, i]) / (grips / grips[:, 2:] @ normals[i])
-        found += (grips[:, 2] / on).tolist()
-    found = [f for f in found if f > 0]
+        said = [f for f in (grips[:, 2] / on).tolist() if f > 0]
+        found += said
+        both += [float(np.sqrt(np.prod(said)))] * (len(said) == 2)
     by = f"the hands at it ({len(found)} views of them)"
     if not found:
         by = "its supposed distance"
         found = (hands.depths[crops.frames] / planes.places[0, :, 2].numpy()).tolist()
     low, middle, high = np.quantile(found, (0.16, 0.5, 0.84))
+    if len(both) >= FEWEST:
+        middle = np.median(both)
     off = np.hypot((high - low) / 2 / middle, GRIP / float(middle * planes.places[0, :, 2].mean()))
     return float(middle), float(off), by
 
