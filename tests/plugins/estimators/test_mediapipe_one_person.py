@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ class Leaping(MediapipeEstimator):
 
     def _run(self, python, out, order, chosen, video, progress, look=False) -> None:
         out.parent.mkdir(parents=True, exist_ok=True)
+        json.dumps(chosen)  # as the script is told
         points = walking(100, 80)
         if chosen is None:
             points[20:35] = walking(90, 220)[20:35]
@@ -62,7 +64,7 @@ class Leaping(MediapipeEstimator):
         else:
             points[self.followed :] = np.nan
         np.savez(
-            out, image_xyzv=points[None], world_xyzv=points[None],
+            out, image_xyzv=np.float32(points[None]), world_xyzv=np.float32(points[None]),
             fate=np.zeros((1, FRAMES), np.uint8),
         )  # fmt: skip
 

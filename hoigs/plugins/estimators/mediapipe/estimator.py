@@ -285,8 +285,8 @@ class MediapipeEstimator(Estimator):
         own = np.flatnonzero(np.isfinite(image[:, 0, 0]) & ~other)
         i = int(own[len(own) // 2])
         low, high = image[i, :, :2].min(0), image[i, :, :2].max(0)
-        low, high = low.clip(0), high.clip(max=(video.width, video.height))
-        human = EntityRequest("human", "human", box=(*low, *high), frame=given[i])
+        box = (*low.clip(0).tolist(), *high.clip(max=(video.width, video.height)).tolist())
+        human = EntityRequest("human", "human", box=box, frame=given[i])
         x, y = image[i, HIPS, :2].mean(0)
         said = (
             f"MediaPipe went over to other people in {int(other.sum())} of {len(given)} frames; "
