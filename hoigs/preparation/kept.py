@@ -59,7 +59,7 @@ PLAN = {
         ("frames",),
         ("human_name", "further_people", "find_person", "everybody", "object_name"),
         slow=True,
-        version=5,
+        version=6,
     ),
     "object_masks": Stage(
         30, ("estimates",), ("object_name", "further_objects"), slow=True, version=11

@@ -37,8 +37,8 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.core.reporting import Progress, no_progress, ranges
 from hoigs.core.system.files import written_whole
 from hoigs.plugins.estimators import steady_masks
+from hoigs.plugins.estimators.mediapipe import one_person
 from hoigs.plugins.estimators.mediapipe.mediapipe_doubts import GONE, LOST, REPAIRED
-from hoigs.plugins.estimators.mediapipe.one_person import someone_else
 from hoigs.plugins.estimators.tools import HEAVY, MEDIAPIPE, run_tool, settings_key
 
 # Masks of people from the bits that `mediapipe_script.py` wrote.
@@ -58,7 +58,7 @@ def steadied(
         out: file of what MediaPipe found; the result is kept beside it.
         size: width and height of the masks. frames: those of the masks, read only if needed.
     """
-    scripts = (Path(steady_masks.__file__), Path(__file__))
+    scripts = (Path(steady_masks.__file__), Path(one_person.__file__), Path(__file__))
     key = zlib.crc32(b"".join(path.read_bytes() for path in scripts))
     kept = out.with_name(f"{out.stem}-steady-{key:08x}.npz")
     if not kept.is_file():
@@ -279,7 +279,7 @@ class MediapipeEstimator(Estimator):
         others: they are followed as if they had been clicked on; if that shows less of them, the
         frames of others are left out. And what there is to say of it."""
         image = found["image_xyzv"][0]
-        other = someone_else(image)
+        other = one_person.someone_else(image)
         if not other.any():
             return out, found, ()
         own = np.flatnonzero(np.isfinite(image[:, 0, 0]) & ~other)
