@@ -19,6 +19,7 @@ REACH = 9  # quarters of its pixels that a pixel may move between: 36 pixels
 LARGEST = 40.0  # difference of colours from which pixels differ entirely
 SAME = (1.4, 2.0)  # a motion explains a pixel up to so much of its own best cost, and more
 FOUND = 7.0  # mean difference of colours up to which a mask is found again; at twice it is not
+NEAREST = 0.7  # how far it counts as found again, at least, in the nearest frames
 INVERTED = 3  # steps by which a motion is inverted: it is nearly a translation
 RIM = 0.12  # breadth of the surroundings of a mask, of the root of its area
 
@@ -29,12 +30,13 @@ class Motion:
 
     Attributes:
         here: colours. beside: of each other frame its colours, the shift y, x of each pixel to it,
-            and what is left of the difference (block matching, coarse to fine).
+            what is left of the difference (block matching, coarse to fine), and whether it is one
+            of the nearest.
     """
 
     here: Float[np.ndarray, "h w 3"]
     beside: Sequence[
-        tuple[Float[np.ndarray, "h w 3"], Int[np.ndarray, "2 h w"], Float[np.ndarray, "h w"]]
+        tuple[Float[np.ndarray, "h w 3"], Int[np.ndarray, "2 h w"], Float[np.ndarray, "h w"], bool]
     ]
 
     @classmethod
@@ -47,7 +49,8 @@ class Motion:
             if near is not None:
                 there = _halved(footage.colors(near[1]))
                 shift = _shifts(here, there)
-                beside.append((there, shift, _costs(here, there, shift, 3)))
+                least = _costs(here, there, shift, 3)
+                beside.append((there, shift, least, first == BESIDE[0][0]))
         return cls(here, beside)
 
     def sets_off(self, mask: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "K 3"]:
@@ -66,10 +69,10 @@ class Motion:
         grown = ndimage.binary_dilation(small)
         around = ndimage.binary_dilation(grown, iterations=breadth) & ~grown
         found = []
-        for there, shift, least in self.beside if small.any() and around.any() else ():
+        for there, shift, least, near in self.beside if small.any() and around.any() else ():
             cost = _costs(self.here, there, np.rint(_affine(small, shift)).astype(int), 3)
             fits, worse = cost < SAME[0] * least + SAME[1], np.log1p(np.maximum(cost - least, 0))
-            again = np.clip(2 - cost[small].mean() / FOUND, 0, 1)
+            again = np.clip(2 - cost[small].mean() / FOUND, NEAREST if near else 0, 1)
             apart = [of[small].mean() - of[around].mean() for of in (fits, -worse)]
             found.append((*apart, again))
         return np.array(found).reshape(-1, 3)

@@ -71,6 +71,7 @@ UNEXPLAINED = (4.0, 7.0, 12.0)  # units of noise by which pixels differ from the
 SCENE = 4.0  # units of noise up to which they look as the scene does
 BESIDE = 0.1  # of a mask on a person: what looks like the scene beside them counts from there on
 MOVING = np.array((0.3, 0.5))  # most that one frame says: a part of what turns is set off, too
+STILL = 0.01  # of what one frame says: up to there nothing moves
 # of `_Judge.features`: the last by 143 clicks anywhere, the others by 83
 WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 3.0)
 POOR = 0.02  # quality below which masks are equally bad
@@ -214,9 +215,11 @@ class _Judge:
         ), -1)  # fmt: skip
 
     def _moves_alone(self, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "2"]:
-        """How much one motion sets a mask off, the mean over the frames beside it, of which those
-        in which it is not found again say nothing; zeros where there are none."""
+        """How much one motion sets a mask off, the mean over the frames beside it; zeros where
+        there are none. A frame in which it is not found again counts as zeros, and one in which
+        nothing moves against it not at all."""
         rows = self.motion.sets_off(mask)
+        rows = rows[(np.abs(rows[:, :2]) > STILL).any(1)]
         said = rows[:, :2].clip(-MOVING, MOVING) * rows[:, 2:]
         return said.mean(0) if len(said) else np.zeros(2)
 
