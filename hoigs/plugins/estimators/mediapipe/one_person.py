@@ -15,7 +15,7 @@ TORSO = [11, 12, 23, 24]  # of the 33 landmarks: shoulders and hips
 LEAP, GROWTH = 0.4, 1.6  # in sizes, and times: what moves, grows or shrinks more is someone else
 A_FRAME = (0.02, 0.01)  # by which these grow with each frame in which nobody is seen
 MOST = (1.0, 2.0)  # up to which
-FEWEST = 5  # frames of someone else: fewer are a pose that was mistaken
+FEWEST = 5  # frames in a row of someone else: fewer are a pose that was mistaken
 
 
 @dataclass
@@ -55,5 +55,7 @@ def someone_else(image: Float[np.ndarray, "N 33 4"]) -> Bool[np.ndarray, " N"]:
             ways.append(_Way([i], middle, size))
     other = np.zeros(len(image), bool)
     for way in sorted(ways, key=lambda w: -len(w.frames))[1:]:
-        other[way.frames] = len(way.frames) >= FEWEST
+        breaks = np.flatnonzero(np.diff(way.frames) > 1) + 1
+        in_a_row = max(len(part) for part in np.split(np.array(way.frames), breaks))
+        other[way.frames] = in_a_row >= FEWEST
     return other
