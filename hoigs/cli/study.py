@@ -67,7 +67,8 @@ def compare(
     )
 
     cells = run_comparison(study, executor=where, limit_s=options.limit_s(), report=_report)
-    about = _about(study.settings, study.device, options)
+    at_once = sorted({c.at_once for c in cells if not c.missing}) or [options.jobs]
+    about = _about(study.settings, study.device, options, at_once)
     if not clips:  # nothing was run
         about = merged_about({path: made for path, (_, made) in loaded.items()})
     for path in write_chart([*cells, *others], study.out, about, mix_machines=options.mix_machines):
@@ -91,16 +92,21 @@ def _steps(text: str) -> list[int]:
 
 
 def _about(
-    settings: tuple[str, ...], device: str, options: ExecutionOptions, **more: str
+    settings: tuple[str, ...],
+    device: str,
+    options: ExecutionOptions,
+    at_once: Sequence[int],
+    **more: str,
 ) -> dict[str, str]:
     """How a study was made, for its files."""
     from hoigs.runs.run_folder import versions
 
+    jobs = " or ".join(map(str, at_once))
     return {
         "date": datetime.now(UTC).date().isoformat(),
         **more,
         "settings": " ".join(settings) or "none",
-        "runs at a time": f"{options.jobs}, {options.each()} threads each, on {device}",
+        "runs at a time": f"{jobs}, {options.each()} threads each, on {device}",
         "versions": ", ".join(f"{name} {value}" for name, value in versions().items()),
     }
 
@@ -142,7 +148,7 @@ def stress(*, options: StressOptions) -> None:
         f"{study.steps} steps from {study.points} Gaussians, seeds 0 to {study.seeds - 1}, "
         f"on built-in clips with {study.base.replace('&', ', ')}"
     )
-    about = _about(study.settings, study.device, options, trainings=trainings)
+    about = _about(study.settings, study.device, options, [options.jobs], trainings=trainings)
     table = make_table(study.cases, definitions, verdicts, about)
     for path in write_stress(table, study.out):
         typer.echo(f"wrote {path}")

@@ -52,6 +52,7 @@ COST = (
     Axis("memory_mb", "peak memory of training (MB)", "lower", 0, timed=True),
 )
 AXES = {axis.name: axis for axis in (*ACCURACY, *COST)}
+TIMED = {axis.name for axis in COST if axis.timed}
 CurvePoint = tuple[int, float, float]  # step, seconds of training, dB
 
 
@@ -68,6 +69,7 @@ class Cell:
         curve: PSNR of a few test frames as training went.
         missing: why there are no values; "" when there are.
         table: of the paper, that the spec is a row of; "" for specs that were chosen freely.
+        at_once: how many trainings ran on the machine at a time.
     """
 
     spec: str
@@ -83,6 +85,7 @@ class Cell:
     curve: tuple[CurvePoint, ...] = ()
     missing: str = ""
     table: str = ""
+    at_once: int = 1
 
     def to_dict(self) -> dict[str, Any]:
         plain = {name: to_json(v) for name, v in self.values.items()}
@@ -102,7 +105,8 @@ class Point:
     """The seeds of one spec, rasterizer and budget, on one clip and one machine.
 
     Attributes:
-        values: mean and spread over `seeds`, by axis name.
+        values: mean and spread over `seeds`, by axis name; what is timed over `timed_seeds`, those
+            that ran beside the fewest others.
         missing: why further seeds have none. curve: mean over seeds.
     """
 
@@ -117,6 +121,7 @@ class Point:
     protocol: tuple[str, ...]
     curve: tuple[CurvePoint, ...]
     missing: Mapping[int, str]
+    timed_seeds: tuple[int, ...]
     table: str = ""
 
     def number(self, axis: Axis) -> float | None:
@@ -133,6 +138,22 @@ class Point:
         """Standard deviation over seeds; 0 with a single seed."""
         value = self.values.get(axis.name)
         return value.std or 0.0 if isinstance(value, Spread) else 0.0
+
+    def seeds_of(self, axis: Axis) -> int:
+        """How many seeds the number is a mean over."""
+        value = self.values.get(axis.name)
+        return len(value.values) if isinstance(value, Spread) else 0
+
+    @property
+    def timed_sentence(self) -> str:
+        """Which seeds the times are of, where they are not of all; else empty."""
+        if self.timed_seeds == self.seeds:
+            return ""
+        one, named = len(self.timed_seeds) == 1, ", ".join(map(str, self.timed_seeds))
+        return (
+            f"Times, joules and memory are of seed{'' if one else 's'} {named}; the others ran "
+            "with more trainings at a time."
+        )
 
 
 def points_of(cells: Sequence[Cell]) -> list[Point]:
@@ -152,12 +173,16 @@ def _point(own: Sequence[Cell], cells: Sequence[Cell]) -> Point:
         for c in cells
         if c.missing and _method(c) == _method(first) and c.clip == first.clip
     }
+    alone = [c for c in own if c.at_once == min(c.at_once for c in own)]
     names = dict.fromkeys(name for cell in own for name in cell.values)
-    values = {name: _over([c.values.get(name) for c in own]) for name in names}
+    values = {
+        name: _over([c.values.get(name) for c in (alone if name in TIMED else own)])
+        for name in names
+    }
     return Point(
         first.spec, first.definition, first.rasterizer, first.steps, first.clip, first.machine,
-        tuple(c.seed for c in own), values, first.protocol, mean_curve([c.curve for c in own]),
-        missing, first.table,
+        tuple(c.seed for c in own), values, alone[0].protocol,
+        mean_curve([c.curve for c in alone]), missing, tuple(c.seed for c in alone), first.table,
     )  # fmt: skip
 
 
@@ -200,8 +225,8 @@ def all_clips(cells: Sequence[Cell]) -> list[Cell]:
             names = dict.fromkeys(name for cell in own for name in cell.values)
             values = {name: _clip_mean(own, name) for name in names}
             protocol = tuple(f"{c.clip}: {' '.join(c.protocol)}" for c in own)
-            merged.append(replace(own[0], clip=ALL_CLIPS, run="", values=values,
-                                  protocol=protocol, curve=()))  # fmt: skip
+            merged.append(replace(own[0], clip=ALL_CLIPS, run="", values=values, protocol=protocol,
+                                  curve=(), at_once=max(c.at_once for c in own)))  # fmt: skip
     return merged
 
 
@@ -248,7 +273,8 @@ def _plain_point(point: Point) -> dict[str, Any]:
         for name, v in point.values.items()
     }
     return vars(point) | {
-        "seeds": list(point.seeds), "values": values, "protocol": list(point.protocol),
+        "seeds": list(point.seeds), "timed_seeds": list(point.timed_seeds),
+        "values": values, "protocol": list(point.protocol),
         "curve": [list(p) for p in point.curve],
         "missing": {str(seed): why for seed, why in point.missing.items()},
     }  # fmt: skip
@@ -347,7 +373,7 @@ class Dominance:
 
     Attributes:
         sure: on every axis where they differ the lead is above the standard deviation, over
-            seeds, of the difference; False where each point has a single seed, and so no spread.
+            seeds, of the difference; False where each has it of a single seed, and so no spread.
     """
 
     winner: Point
@@ -386,12 +412,12 @@ def dominances(points: Sequence[Point], axes: Sequence[Axis]) -> list[Dominance]
 
 
 def _sure(a: Point, b: Point, axes: Sequence[Axis]) -> bool:
-    if len(a.seeds) < 2 and len(b.seeds) < 2:
-        return False
-    leads = [(axis, abs(a.known(axis) - b.known(axis))) for axis in axes]
-    return all(
-        lead == 0 or lead > math.hypot(a.spread(axis), b.spread(axis)) for axis, lead in leads
-    )
+    for axis in axes:
+        lead = abs(a.known(axis) - b.known(axis))
+        several = max(a.seeds_of(axis), b.seeds_of(axis)) > 1
+        if lead and not (several and lead > math.hypot(a.spread(axis), b.spread(axis))):
+            return False
+    return True
 
 
 def usable_axes(

@@ -86,6 +86,7 @@ def foot_notes(points: Sequence[Point], absent: Mapping[str, str]) -> list[str]:
         + (f" Larger markers: more steps ({', '.join(map(str, steps))})." if len(steps) > 1
            else f" {steps[0]} steps.")
     )  # fmt: skip
+    notes += [points[0].timed_sentence] if points[0].timed_sentence else []
     lost = [f"{p.spec} seed {s}: {why}" for p in points for s, why in p.missing.items()]
     notes += [f"Missing: {'; '.join(lost)}."] if lost else []
     notes += [f"{name}: {why}." for name, why in absent.items()]

@@ -161,7 +161,7 @@ def gather(planned: Planned, failed: Mapping[str, str]) -> Cell:
 
 
 def measured(job: Job) -> dict[str, Any]:
-    """The fields machine, values, protocol and curve of a job that is done."""
+    """The fields machine, values, protocol, curve and at_once of a job that is done."""
     scores, cost = job.scores(), read_cost(job.folder)
     absent = NotComputed("this evaluation has no such score")
     found = measures_of(scores)
@@ -173,6 +173,7 @@ def measured(job: Job) -> dict[str, Any]:
         "values": values,
         "protocol": protocol_of(scores, cost),
         "curve": curve_of(job.folder),
+        "at_once": cost.runs_at_once,
     }
 
 

@@ -120,7 +120,8 @@ def markdown(
             for title, axes in paper.columns(points):
                 lines += [f"{title}:", "", *_grid(axes, points), ""]
             lines += paper.published_table(points[0].table)
-        lines += ["Protocol:", "", *(f"- {s}" for s in points[0].protocol), ""]
+        said = [*points[0].protocol, points[0].timed_sentence]
+        lines += ["Protocol:", "", *(f"- {s}" for s in said if s), ""]
     lost = [c for c in cells if c.missing]
     if lost:
         lines += ["## Not run or failed", ""]

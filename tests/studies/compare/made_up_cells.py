@@ -30,7 +30,7 @@ def cell(spec: str = "hoigs", psnr: float = 20.0, train_s: float = 10.0, **more:
     """One cell with two numbers, and any others by keyword."""
     fields = {"definition": spec, "rasterizer": "warp", "steps": 100, "clip": "carry", "seed": 0,
               "run": f"runs/carry/{spec}", "machine": A, "protocol": PROTOCOL}  # fmt: skip
-    named = {k: more.pop(k) for k in list(more) if k in (*fields, "curve", "missing")}
+    named = {k: more.pop(k) for k in list(more) if k in (*fields, "curve", "missing", "at_once")}
     values: dict[str, Value] = {"psnr_human_object": psnr, "train_s": train_s, **more}  # type: ignore[dict-item]
     return Cell(spec=spec, values=values, **{**fields, **named})  # type: ignore[arg-type]
 

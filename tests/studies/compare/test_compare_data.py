@@ -43,6 +43,21 @@ def test_a_number_that_one_seed_lacks_is_not_a_mean_of_the_others() -> None:
     assert point.values["joules"] == NO_JOULES
 
 
+def test_times_are_of_the_seeds_that_ran_beside_the_fewest_others() -> None:
+    curve = ((1, 1.0, 10.0), (2, 2.0, 20.0))
+    cells = [cell(spec, psnr + s, train_s * (1 + 3 * s), seed=s, at_once=1 + 7 * s, curve=curve)
+             for spec, psnr, train_s in (("a", 30.0, 5.0), ("b", 20.0, 9.0))
+             for s in (0, 1)]  # fmt: skip
+    a, b = points_of(cells)
+    assert (a.number(PSNR), a.number(TIME)) == (30.5, 5.0)
+    assert (a.seeds_of(PSNR), a.seeds_of(TIME), a.seeds, a.timed_seeds) == (2, 1, (0, 1), (0,))
+    assert a.timed_sentence.startswith("Times, joules and memory are of seed 0;")
+    assert a.curve == curve and not points_of(cells[:1])[0].timed_sentence
+    (found,) = dominances([a, b], (PSNR,))
+    (timed,) = dominances([a, b], (TIME, PSNR))
+    assert found.sure and not timed.sure
+
+
 def test_curves_are_averaged_where_every_seed_has_a_step() -> None:
     cells = [cell(curve=((1, 1.0, 10.0), (2, 2.0, 20.0))), cell(seed=1, curve=((2, 4.0, 22.0),))]
     assert points_of(cells)[0].curve == ((2, 3.0, 21.0),)
