@@ -11,6 +11,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -143,8 +144,7 @@ def load_yaml(text: str, source: str) -> Document:
     """
     _check_size(text, source)
     try:
-        loader = Loader(text)
-        node = loader.get_single_node()
+        node = _composed(text)
         if node is None:
             raise SpecError(f"{source}: the file is empty")
         document = Document(source)
@@ -161,6 +161,11 @@ def load_yaml(text: str, source: str) -> Document:
         raise SpecError(f"{document.where(())}: expected `key: value` lines, got {_name(data)}")
     document.data = data
     return document
+
+
+@lru_cache(maxsize=32)  # a study reads the same presets for every candidate
+def _composed(text: str) -> yaml.Node | None:
+    return Loader(text).get_single_node()
 
 
 def _built(node: yaml.Node, place: Place, document: Document) -> Any:

@@ -53,6 +53,7 @@ COST = (
 )
 AXES = {axis.name: axis for axis in (*ACCURACY, *COST)}
 TIMED = {axis.name for axis in COST if axis.timed}
+UNEVEN = "more trainings ran at a time for some clips than for others"
 CurvePoint = tuple[int, float, float]  # step, seconds of training, dB
 
 
@@ -211,7 +212,8 @@ def mean_curve(curves: Sequence[Sequence[CurvePoint]]) -> tuple[CurvePoint, ...]
 def all_clips(cells: Sequence[Cell]) -> list[Cell]:
     """Each seed's mean over clips, of what has been run on every clip by one machine.
 
-    A number that one clip lacks is not computed, with that clip's reason.
+    A number that one clip lacks is not computed, with that clip's reason; nor are costs where clips
+    were trained with different numbers of trainings at a time.
     """
     clips = list(dict.fromkeys(c.clip for c in cells))
     groups: dict[tuple[Any, ...], list[Cell]] = {}
@@ -224,6 +226,8 @@ def all_clips(cells: Sequence[Cell]) -> list[Cell]:
         if {c.clip for c in own} == set(clips):
             names = dict.fromkeys(name for cell in own for name in cell.values)
             values = {name: _clip_mean(own, name) for name in names}
+            if len({c.at_once for c in own}) > 1:
+                values |= dict.fromkeys(TIMED & set(names), NotComputed(UNEVEN))
             protocol = tuple(f"{c.clip}: {' '.join(c.protocol)}" for c in own)
             merged.append(replace(own[0], clip=ALL_CLIPS, run="", values=values, protocol=protocol,
                                   curve=(), at_once=max(c.at_once for c in own)))  # fmt: skip

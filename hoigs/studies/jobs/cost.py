@@ -200,7 +200,8 @@ class Cost:
 
     Attributes:
         train_s: seconds of all steps, checkpoints on the way included, previews and scoring not.
-        joules: from the first step to the last, previews included. source: what they measure.
+        joules: from the first step to the last, previews included, where nothing ran beside.
+        source: what they measure.
         memory_mb: peak in MB, of the GPU where there is one; previews included.
         memory_source: what that measures.
         machines: fingerprint of each; more than one if the run was moved.
@@ -257,15 +258,22 @@ def read_cost(folder: Path) -> Cost:
     parts = study["parts"]
     if "train_s" not in study:
         return Cost(NotComputed(OLD), NotComputed(OLD), "", NotComputed(OLD), "", (), 1)
-    whole = len(parts) == 1 and "joules" in parts[0]
+    at_once = max((p["runs_at_once"] for p in parts), default=1)
+    joules: Value = NotComputed(INTERRUPTED)
+    if at_once > 1:
+        joules = NotComputed(
+            f"the meter counts all trainings of the machine, of which {at_once} ran"
+        )
+    elif len(parts) == 1 and "joules" in parts[0]:
+        joules = from_json(parts[0]["joules"])
     return Cost(
         train_s=float(study["train_s"]),
-        joules=from_json(parts[0]["joules"]) if whole else NotComputed(INTERRUPTED),
-        source=parts[-1].get("source", "") if parts else "",
+        joules=joules,
+        source=parts[-1].get("source", "") if parts and at_once == 1 else "",
         memory_mb=_most(parts) if parts else NotComputed(NO_MEMORY),
         memory_source=parts[-1].get("memory_source", "") if parts else "",
         machines=tuple(dict.fromkeys(Machine(**p["machine"]).words for p in parts)),
-        runs_at_once=max((p["runs_at_once"] for p in parts), default=1),
+        runs_at_once=at_once,
     )
 
 

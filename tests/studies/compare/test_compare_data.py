@@ -12,6 +12,7 @@ from hoigs.core.errors import HoigsError
 from hoigs.evaluation.protocol import NotComputed
 from hoigs.studies.compare.data import (
     AXES,
+    UNEVEN,
     all_clips,
     dominances,
     dominates,
@@ -56,6 +57,13 @@ def test_times_are_of_the_seeds_that_ran_beside_the_fewest_others() -> None:
     (found,) = dominances([a, b], (PSNR,))
     (timed,) = dominances([a, b], (TIME, PSNR))
     assert found.sure and not timed.sure
+
+
+def test_the_mean_of_clips_has_costs_where_all_ran_beside_as_many_others() -> None:
+    (even,) = all_clips([cell(clip="a", at_once=4), cell(clip="b", psnr=30.0, at_once=4)])
+    (uneven,) = all_clips([cell(clip="a"), cell(clip="b", psnr=30.0, at_once=4)])
+    assert even.values == {"psnr_human_object": 25.0, "train_s": 10.0} and even.at_once == 4
+    assert uneven.values == even.values | {"train_s": NotComputed(UNEVEN)}
 
 
 def test_curves_are_averaged_where_every_seed_has_a_step() -> None:

@@ -64,6 +64,10 @@ def test_an_interrupted_training_has_seconds_but_no_joules(tmp_path: Path) -> No
     cost = read_cost(tmp_path)
     assert cost.train_s == 4.5 and cost.joules == NotComputed(INTERRUPTED)
     assert [m.partition(",")[0] for m in cost.machines] == ["Xeon", "Ryzen"]
+    _study(tmp_path, whole | {"runs_at_once": 3})
+    shared = read_cost(tmp_path)
+    assert isinstance(shared.joules, NotComputed) and "3" in shared.joules.reason
+    assert not shared.source and shared.runs_at_once == 3
     (tmp_path / "study.json").unlink()
     assert read_cost(tmp_path).train_s == NotComputed(OLD)
 
