@@ -68,7 +68,7 @@ PLAN = {
         3,
         ("frames", "estimates"),
         ("camera", "focal", "intrinsics", "calibration", "keep_borders"),
-        version=7,
+        version=8,
     ),
     "people": Stage(
         46,

@@ -26,6 +26,7 @@ from hoigs.preparation.cameras.known import given_cameras, megasam_cameras, vggt
 from hoigs.preparation.cameras.sfm import structure_from_motion
 from hoigs.preparation.cameras.turning_cameras import (
     NEAR,
+    PIXELS,
     BackgroundMotion,
     background_motion,
     turning_cameras,
@@ -161,7 +162,7 @@ def _turning(
 def _turns(motion: BackgroundMotion) -> str:
     return (
         f"the camera turns (by {motion.turns:.1f} degrees between two of the compared "
-        f"frames; the background moves by up to {motion.largest:.0f} px at a width of 640)"
+        f"frames; the background moves by up to {motion.largest:.0f} px {PIXELS})"
     )
 
 
@@ -193,7 +194,7 @@ def _static(
     if motion.known:
         figures = {"displacement_px": round(motion.largest, 3)}
         how = (
-            f"; features outside the masks move by up to {motion.largest:.2f} px at a width of 640"
+            f"; features outside the masks move by up to {motion.largest:.2f} px {PIXELS}"
         )
     if lens is not None:
         track = static_cameras(video, *lens)
@@ -234,7 +235,7 @@ def _doubts(motion: BackgroundMotion, declared: bool) -> list[str]:
     seen = np.isfinite(motion.displacement).sum()
     return [
         f"the camera was declared static, but it moves: the background by up to "
-        f"{motion.largest:.1f} px at a width of 640, in {seen} of {len(motion.displacement)} "
+        f"{motion.largest:.1f} px {PIXELS}, in {seen} of {len(motion.displacement)} "
         "compared frames that show it again; without --camera static hoigs finds its way"
     ]
 

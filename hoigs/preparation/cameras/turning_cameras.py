@@ -46,9 +46,10 @@ def quiet_colmap() -> Iterator[None]:
 
 
 FRAMES = 6  # compared with another one; SIFT takes about half a second each
-WIDTH = 640  # at which they are
+SIDE = 640  # the longer one of the images that are compared: a phone held upright shows no more
+PIXELS = f"at {SIDE} along the longer side"
 FEATURES, ENOUGH = 1500, 25  # of an image; matches that make a pair count
-STILL = 1.0  # pixels at WIDTH: codecs and rolling light move features by a few tenths
+STILL = 1.0  # pixels at SIDE: codecs and rolling light move features by a few tenths
 INNER = 4  # compared frames between the first and the last, from which on those two may differ
 FEW = 8  # matches that may show a moved camera
 COHERENT = 0.3  # of a camera's shift: half of the matches that show it are so near to it
@@ -62,7 +63,7 @@ class BackgroundMotion:
     if those between the first and the last agree and these two do not.
 
     Attributes:
-        displacement: pixels at a width of 640, the median over features, of each compared frame;
+        displacement: pixels at SIDE, the median over features, of each compared frame;
             NaN where too few features were found again.
         matches: features found again, of each compared frame.
         features: in that one frame.
@@ -100,7 +101,7 @@ class BackgroundMotion:
 
     @property
     def largest(self) -> float:
-        """Largest median displacement, pixels at a width of 640; 0 if nothing was found again."""
+        """Largest median displacement, pixels at SIDE; 0 if nothing was found again."""
         seen = np.isfinite(self.displacement)
         return float(self.displacement[seen].max()) if seen.any() else 0.0
 
@@ -121,7 +122,7 @@ def background_motion(video: Frames, masks: GivenMasks) -> BackgroundMotion:
     if motion.static:
         compared = list(zip(chosen, found, strict=True))
         return replace(motion, still=_still_part(video, masks, compared, reference))
-    size = (WIDTH, round(video.height * WIDTH / video.width))
+    size = _at_side(video.width, video.height)
     near = [paired(one, other) for one, other in pairwise(found)]
     far = [paired(found[0], other) for other in found[2:]]
     if min(len(one) for one, _ in near) < ENOUGH:
@@ -202,7 +203,7 @@ def _moved(pair: Pair) -> bool:
 def background_features(
     video: Frames, masks: GivenMasks, chosen: Sequence[int]
 ) -> Iterator[Features]:
-    """SIFT's of the chosen frames, outside the masks: positions, pixels at WIDTH, and unit
+    """SIFT's of the chosen frames, outside the masks: positions, pixels at SIDE, and unit
     descriptors."""
     from hoigs.core.system.colmap import pycolmap
 
@@ -221,9 +222,9 @@ def paired(one: Features, two: Features) -> Pair:
 
 
 def _features(sift, image: UInt8[np.ndarray, "H W 3"], moving: Bool[np.ndarray, "H W"]) -> Features:
-    """Positions, pixels at WIDTH, and unit descriptors of features outside the mask."""
-    scale = WIDTH / image.shape[1]
-    size = (min(WIDTH, image.shape[1]), max(1, round(image.shape[0] * min(1.0, scale))))
+    """Positions, pixels at SIDE, and unit descriptors of features outside the mask."""
+    height, width = moving.shape
+    size = (width, height) if max(width, height) <= SIDE else _at_side(width, height)
     small = shrink(image, *size)
     grey = np.ascontiguousarray(np.array(Image.fromarray(small).convert("L")))
     hidden = shrink_mask(grown(moving), *size)
@@ -233,7 +234,13 @@ def _features(sift, image: UInt8[np.ndarray, "H W 3"], moving: Bool[np.ndarray, 
     seen = ~hidden[row, column]
     descriptors = np.asarray(found.data, np.float32)[seen]
     descriptors /= np.linalg.norm(descriptors, axis=-1, keepdims=True).clip(1e-6)
-    return xy[seen] * (WIDTH / size[0]), descriptors
+    return xy[seen] * (SIDE / max(size)), descriptors
+
+
+def _at_side(width: int, height: int) -> tuple[int, int]:
+    """Width and height with a longer side of SIDE."""
+    scale = SIDE / max(width, height)
+    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _matched(
@@ -261,7 +268,7 @@ def grown(mask: Bool[np.ndarray, "H W"], margin: float = MARGIN) -> Bool[np.ndar
 FOCALS = np.geomspace(0.5, 2.5, 12)  # tried, in longer sides of the image
 NEAR = 1.5  # pixels from where a rotation would put a feature
 SHARE = 0.8  # of the features, in how far most are off
-FAINT = 6.0  # pixels at WIDTH: with less parallax, about 0.7 degrees, structure from motion fails
+FAINT = 6.0  # pixels at SIDE: with less parallax, about 0.7 degrees, structure from motion fails
 REWEIGHTINGS = 6
 
 Pair = tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 2"]]
@@ -376,7 +383,7 @@ def turning_cameras(
     Raises:
         SourceError: most frames' background is not found again in their neighbours.
     """
-    size = (WIDTH, round(video.height * WIDTH / video.width))
+    size = _at_side(video.width, video.height)
     start = lens[0] if lens else pinhole(video, focal.pixels)
     K = start.resized(*size).K.numpy()
     straight = start.undistortion(size).pixels
@@ -446,7 +453,7 @@ def _track(video: Frames, lens: Lens, how: str, turns: Turns, zoom: float) -> Ca
             for camera, pose in zip(still.cameras, poses, strict=True)
         ],
         provenance=f"{provenance}, up to {max(angles):.1f} degrees from the middle; features "
-        f"outside the masks lie {turns.off:.2f} px (median, at a width of {WIDTH}) off",
+        f"outside the masks lie {turns.off:.2f} px (median, {PIXELS}) off",
         figures=still.figures | figures | {"turn_degrees": round(max(angles), 2)},
     )
 

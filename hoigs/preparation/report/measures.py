@@ -59,7 +59,8 @@ class Measures:
             as shares of it; None: it is given, or of structure from motion.
         up_known: what tells which way is up (`hoigs.core.values.world.World`). up_within: degrees
             within which it is; None: not known.
-        displacement_px: of a static camera's background, at a width of 640; None if not measured.
+        displacement_px: of a static camera's background, at 640 along the longer side; None if not
+            measured.
         sharpness: of each frame (`sharpness.sharpness`).
         body_residuals_px: of each frame; None without landmarks.
         body_residual_m: `body_residual_px` at the person's distance.

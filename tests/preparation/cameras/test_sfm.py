@@ -131,6 +131,18 @@ def test_a_camera_in_a_hand_is_one_that_turns(tmp_path: Path) -> None:
     assert chosen.track.figures["focal_low_px"] < FOCAL < chosen.track.figures["focal_high_px"]
 
 
+def test_a_video_that_was_taken_upright_is_measured_by_its_longer_side(tmp_path: Path) -> None:
+    lying, masks = recorded(tmp_path / "lying", [0.0, 0.01, -0.01, 0.005], block=False)
+    (tmp_path / "upright").mkdir()
+    for i, frame in enumerate(lying):
+        Image.fromarray(np.rot90(frame)).save(tmp_path / f"upright/{i:05d}.png")
+    upright = open_frames(tmp_path / "upright")
+    turned = GivenMasks(together=MaskStack([np.rot90(masks.moving(i)) for i in range(len(lying))]))
+    one, other = background_motion(lying, masks), background_motion(upright, turned)
+    assert other.displacement == pytest.approx(one.displacement, rel=0.05)
+    assert other.parallax == pytest.approx(one.parallax, rel=0.2)
+
+
 def turning_video(folder: Path, yaw: list[float]) -> tuple[Frames, GivenMasks]:
     """A camera that looks at the wall from one place, turned by these degrees."""
     folder.mkdir()
