@@ -19,7 +19,12 @@ from hoigs.plugins.estimators.object_tracker.footage import (
     odds_of,
 )
 from hoigs.plugins.estimators.object_tracker.motion import Motion
-from hoigs.plugins.estimators.object_tracker.scene import Scene, median_of
+from hoigs.plugins.estimators.object_tracker.scene import (
+    Scene,
+    StaticScene,
+    median_of,
+    scene_without,
+)
 
 # A soft mask that follows edges: a random walker with priors.
 
@@ -110,6 +115,10 @@ def prompted_mask(
     least = AT_PERSON if box is None else 0.5
     on_person = bool(footage.person[i][shown].mean() > least) if shown.any() else False
     at_rest = not median_of(away[seed]) > SCENE
+    if at_rest and isinstance(scene, StaticScene):
+        bare = scene_without(scene, i, seed)
+        if bare is not None and median_of((changed := bare.difference(i))[seed]) > SCENE:
+            away, at_rest = changed, False  # frames without it show its outline
     fixed = _evidence(footage.body(i), away, on_person, at_rest, box is not None)
     barred = footage.blank[i] | _disc(footage.shape, outside, max(1.5, 0.008 * footage.diagonal))
     fixed[barred] = -9

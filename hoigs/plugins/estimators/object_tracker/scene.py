@@ -151,6 +151,7 @@ def _fitted(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 SAMPLES = 48  # frames of which the median is taken
 NEIGHBOURS = (-24, -16, -10, -6, 6, 10, 16, 24)  # frames that a moving camera's are compared with
+GONE, FEW = 6.0, 6  # units of noise by which the place of a thing has changed; such samples
 SHIFT = 2  # pixels, the largest of the shifts that parallax is allowed
 SHIFTS = ((0, 0), (0, 2), (0, -2), (2, 0), (-2, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
@@ -181,6 +182,31 @@ def static_scene(footage: Footage) -> StaticScene:
     for row in range(len(picks)):
         hidden[row] = ndimage.binary_dilation(hidden[row], iterations=4)
     return _still_parts(footage, picks, hidden)
+
+
+def scene_without(
+    scene: StaticScene, i: int, thing: Bool[np.ndarray, "h w"]
+) -> StaticScene | None:
+    """The scene of the frames from which a thing that rests in frame i has gone.
+
+    Args:
+        thing: pixels of it in frame i.
+
+    Returns:
+        None where it stays, or people hide where it was.
+    """
+    footage, noise = scene.footage, float(np.nanmedian(scene.spread))
+    picks = _samples(footage, 2 * SAMPLES)
+    hidden = footage.person[picks] | footage.blank[picks]
+    here = footage.colors(i)[thing]
+    gone = []
+    for row, j in enumerate(picks):
+        hidden[row] = ndimage.binary_dilation(hidden[row], iterations=4)
+        away = shadowless(footage.colors(j)[thing] - here, here) / noise
+        gone.append(not hidden[row][thing].any() and float(np.median(away)) > GONE)
+    if sum(gone) < FEW:
+        return None
+    return _still_parts(footage, picks[gone], hidden[gone])
 
 
 def scene_behind(footage: Footage, masks: Bool[np.ndarray, "F h w"], around: float) -> StaticScene:
@@ -311,7 +337,9 @@ def median_of(differences: np.ndarray) -> float:
     return float(np.median(known)) if known.size else float("nan")
 
 
-def shadowless(away: np.ndarray, scene: np.ndarray) -> Float[np.ndarray, "h w"]:
+def shadowless(
+    away: Float[np.ndarray, "*N 3"], scene: Float[np.ndarray, "*N 3"]
+) -> Float[np.ndarray, "*N"]:
     """Length of a difference of colours, less where only lightness falls, as in a shadow."""
     light, chroma = away[..., 0], np.hypot(away[..., 1], away[..., 2])
     share = light / np.maximum(scene[..., 0], 1.0)

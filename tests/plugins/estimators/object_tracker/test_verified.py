@@ -309,3 +309,23 @@ def test_a_click_on_what_is_tiny_does_not_take_in_the_shirt_behind_it() -> None:
     found = prompted_mask(footage, static_scene(footage), 3, FramePrompt(3, (PromptPoint(x, y),)))
     assert not looks_like_person(footage, found)
     assert overlap(found.soft > 0.5, cups[3]) > 0.5
+
+
+def test_a_click_on_what_rests_and_is_taken_away_leaves_out_what_it_rests_on() -> None:
+    """A board of nearly its colours lies under it. The board was a part of the thing."""
+    wall, board, ball = (
+        texture(k, color) for k, color in enumerate(((60, 70, 120), (150, 112, 80), (150, 108, 72)))
+    )
+    frames, nobody = [], []
+    on_board = (Y > 36) & (X > 20) & (X < 80)
+    for i in range(30):
+        image = wall[:, :W].copy()
+        image[on_board] = board[:, :W][on_board]
+        thing = disc(48, 52) if i < 18 else disc(60 + i, 20)
+        image[thing] = ball[:, :W][thing]
+        frames.append(image.astype(np.uint8))
+        nobody.append(np.zeros((H, W), bool))
+    footage = footage_of(frames, nobody)
+    prompt = FramePrompt(2, (PromptPoint(48.0, 52.0),))
+    found = prompted_mask(footage, static_scene(footage), 2, prompt)
+    assert overlap(found.soft > 0.5, disc(48, 52)) > 0.85
