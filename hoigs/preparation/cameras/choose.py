@@ -193,9 +193,7 @@ def _static(
     figures, warnings, how = {}, _doubts(motion, options.camera == "static"), ""
     if motion.known:
         figures = {"displacement_px": round(motion.largest, 3)}
-        how = (
-            f"; features outside the masks move by up to {motion.largest:.2f} px {PIXELS}"
-        )
+        how = f"; features outside the masks move by up to {motion.largest:.2f} px {PIXELS}"
     if lens is not None:
         track = static_cameras(video, *lens)
     else:

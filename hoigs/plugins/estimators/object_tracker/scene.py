@@ -184,9 +184,7 @@ def static_scene(footage: Footage) -> StaticScene:
     return _still_parts(footage, picks, hidden)
 
 
-def scene_without(
-    scene: StaticScene, i: int, thing: Bool[np.ndarray, "h w"]
-) -> StaticScene | None:
+def scene_without(scene: StaticScene, i: int, thing: Bool[np.ndarray, "h w"]) -> StaticScene | None:
     """The scene of the frames from which a thing that rests in frame i has gone.
 
     Args:
