@@ -388,10 +388,11 @@ def _masks(
 def _away(
     footage: Footage, shape: Shape, i: int, places: Sequence[Place]
 ) -> Float[np.ndarray, "P h w"]:
-    """Distances of all pixels from the shapes at places, negative inside. What two have in common
-    is the one's that is before the other: whose rim is an edge of the picture there."""
+    """Distances of pixels from the shapes at places, negative inside, as far as an object may reach
+    beyond its shape. What two have in common is the one's that is before the other: whose rim is an
+    edge of the picture there."""
     drawn = [shape.drawn(p.middle) for p in places]
-    far = [ndimage.distance_transform_edt(~d) - ndimage.distance_transform_edt(d) for d in drawn]
+    far = [_distances(d, int(RIM * shape.breadth) + 2) for d in drawn]
     light = ndimage.gaussian_filter(footage.colors(i)[..., 0], 1.0)
     steep = np.hypot(*np.gradient(light))
     rims = [d ^ ndimage.binary_erosion(d) for d in drawn]
@@ -403,3 +404,13 @@ def _away(
                 near, behind = (a, b) if mine > theirs else (b, a)
                 far[behind][both] = np.maximum(far[behind], far[near] + 1)[both]
     return np.array(far).reshape(-1, *footage.shape)
+
+
+def _distances(drawn: Bool[np.ndarray, "h w"], reach: int) -> Float[np.ndarray, "h w"]:
+    """Of pixels from a shape, negative inside; farther than `reach` they are `reach` or more."""
+    found = np.full(drawn.shape, float(reach))
+    for box in ndimage.find_objects(drawn.astype(np.uint8)):
+        near = tuple(slice(max(0, side.start - reach), side.stop + reach) for side in box)
+        cut = drawn[near]
+        found[near] = ndimage.distance_transform_edt(~cut) - ndimage.distance_transform_edt(cut)
+    return found
