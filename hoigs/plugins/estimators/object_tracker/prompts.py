@@ -79,6 +79,7 @@ MOVING = np.array((0.3, 0.5))  # most that one frame says: a part of what turns 
 STILL = 0.01  # of what one frame says: up to there nothing moves
 # of `_Judge.features`: the last by 143 clicks anywhere, the others by 83
 WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 3.0)
+AS_GOOD = 0.25  # logarithms below the best up to which another mask is nearly as good
 POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
@@ -129,20 +130,25 @@ def prompted_mask(
     judge = _Judge(footage, i, away, on_person, box, Motion.of(footage, i))
     none = PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person, barred)
 
-    def best(tried: list[_Tried]) -> PromptedMask:
+    def best(tried: list[_Tried], other: bool = False) -> PromptedMask:
+        """other: of those that are nearly as good, the best that does not look like a person."""
         if not tried:
             return none
-        k = int(judge.scores(tried).argmax())
-        return replace(none, soft=tried[k].soft, quality=judge.quality(tried)[k])
+        scores, quality = judge.scores(tried), judge.quality(tried)
+        found = [replace(none, soft=t.soft, quality=q) for t, q in zip(tried, quality, strict=True)]
+        for k in (-scores).argsort():
+            if not other or not looks_like_person(footage, found[k]):
+                return found[k] if scores[k] > scores.max() - AS_GOOD else none
+        return none
 
     tried = growth.masks()
     if box is None and not at_rest and not on_person:
         tried += growth.unexplained(away)
     found = best(tried)
     if box is None and found.quality > 0 and looks_like_person(footage, found):
-        tiny = best(growth.masks(TINY))
-        if tiny.quality > 0 and not looks_like_person(footage, tiny):
-            return tiny
+        for instead in (best(tried, other=True), best(growth.masks(TINY))):
+            if instead.quality > 0 and not looks_like_person(footage, instead):
+                return instead
     return found
 
 

@@ -6,10 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from disc_world import COUNT, RADIUS, H, W, click, masks_of, overlaps, request, texture, world
+from disc_world import (
+    COUNT,
+    RADIUS,
+    H,
+    W,
+    click,
+    masks_of,
+    overlaps,
+    places,
+    request,
+    texture,
+    world,
+)
 from test_behind import footage_of
 
 from hoigs.core.interfaces.estimator import FramePrompt, PromptPoint
+from hoigs.plugins.estimators.object_tracker import prompts
 from hoigs.plugins.estimators.object_tracker.appearance import Appearance, half_breadth
 from hoigs.plugins.estimators.object_tracker.footage import Footage
 from hoigs.plugins.estimators.object_tracker.prompts import (
@@ -329,3 +342,22 @@ def test_a_click_on_what_rests_and_is_taken_away_leaves_out_what_it_rests_on() -
     prompt = FramePrompt(2, (PromptPoint(48.0, 52.0),))
     found = prompted_mask(footage, static_scene(footage), 2, prompt)
     assert overlap(found.soft > 0.5, disc(48, 52)) > 0.85
+
+
+def test_another_mask_that_is_nearly_as_good_is_taken_where_the_best_looks_like_a_person(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frames, people, discs = world()
+    footage = footage_of(frames, [p | d for p, d in zip(people, discs, strict=True)])
+    (x, y), scene = places()[3], static_scene(footage)
+    prompt = FramePrompt(3, (PromptPoint(x + 5, y),))
+
+    def shown() -> np.ndarray:
+        return prompted_mask(footage, scene, 3, prompt).soft > 0.5
+
+    best = shown()
+    assert overlap(best, discs[3]) > 0.9
+    monkeypatch.setattr(prompts, "looks_like_person", lambda _, m: ((m.soft > 0.5) == best).all())
+    assert (shown() == best).all()  # the next mask is worse by .59, as its logarithm says
+    monkeypatch.setattr(prompts, "AS_GOOD", 1.0)
+    assert 0.8 < overlap(shown(), best) < 1
