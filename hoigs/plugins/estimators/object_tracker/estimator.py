@@ -27,6 +27,7 @@ from hoigs.plugins.estimators.object_tracker.alike import told_apart
 from hoigs.plugins.estimators.object_tracker.appearance import Appearance
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage, skeletons
 from hoigs.plugins.estimators.object_tracker.prompts import (
+    SET_OFF,
     PromptedMask,
     looks_like_person,
     overlap,
@@ -127,7 +128,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 31  # of what is kept in `work`; raised when masks change
+VERSION = 32  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -149,7 +150,6 @@ EQUAL = (
     "nothing is shown, and a click there or later says it"
 )
 SHARED = 0.3  # of a mask that is another object's, from which it is that
-SET_OFF = 0.65  # quality of a mask below which what rests is rather a part of the scene
 
 
 class ObjectTrackerConfig(ComponentConfig):

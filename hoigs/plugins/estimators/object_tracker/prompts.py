@@ -80,6 +80,7 @@ STILL = 0.01  # of what one frame says: up to there nothing moves
 # of `_Judge.features`: the last by 143 clicks anywhere, the others by 83
 WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 3.0)
 AS_GOOD = 0.25  # logarithms below the best up to which another mask is nearly as good
+SET_OFF = 0.65  # quality below which a mask may be a patch of what is around it
 POOR = 0.02  # quality below which masks are equally bad
 INSIDE = (0.6, 1.5, 3.0)  # log-odds of the inside of a box, tried in turn
 
@@ -146,9 +147,11 @@ def prompted_mask(
         tried += growth.unexplained(away)
     found = best(tried)
     if box is None and found.quality > 0 and looks_like_person(footage, found):
-        for instead in (best(tried, other=True), best(growth.masks(TINY))):
-            if instead.quality > 0 and not looks_like_person(footage, instead):
-                return instead
+        other, tiny = best(tried, other=True), best(growth.masks(TINY))
+        if other.quality > 0:
+            return other
+        if tiny.quality > SET_OFF and not looks_like_person(footage, tiny):
+            return tiny
     return found
 
 
