@@ -3,6 +3,7 @@
     python benchmarks/clicks.py                        # all cases, about a minute each
     python benchmarks/clicks.py club board-cam03 --sheet build/sheets --jobs 8
     python benchmarks/clicks.py --anywhere 6           # the first mask alone, of clicks anywhere
+    python benchmarks/clicks.py --no-network           # by colours, edges and motion alone
 
 Real frames with truth. Into recordings of shared/data an object is drawn whose mask is known: it
 follows landmarks of a hand or flies, is blurred by its motion, softened, given noise, and the whole
@@ -53,7 +54,8 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.plugins.estimators.object_tracker import footage as tracker_footage
 from hoigs.plugins.estimators.object_tracker import scene as tracker_scene
 from hoigs.plugins.estimators.object_tracker.estimator import WEAK, ObjectTrackerEstimator
-from hoigs.plugins.estimators.object_tracker.prompts import prompted_mask
+from hoigs.plugins.estimators.object_tracker.outlined import clicked_mask
+from hoigs.plugins.estimators.object_tracker.outlines import Outlines
 from hoigs.plugins.estimators.object_tracker.states import DOUBTFUL
 
 SHARED = Path(os.environ.get("HOIGS_SHARED", Path(__file__).resolve().parents[2] / "shared"))
@@ -477,7 +479,7 @@ def request(film: Footage, work: Path, entities: tuple[EntityRequest, ...] = ())
     )
 
 
-def anywhere(name: str, cache: Path, count: int) -> dict:
+def anywhere(name: str, cache: Path, count: int, network: bool) -> dict:
     """The masks of `count` clicks at random pixels of the object in random frames."""
     case, rng = CASES[name], np.random.default_rng(7)
     film = footage_of(case, cache)
@@ -487,21 +489,26 @@ def anywhere(name: str, cache: Path, count: int) -> dict:
     scene = (tracker_scene.static_scene if still else tracker_scene.moving_scene)(footage)
     shown = [i for i, true in enumerate(film.truth) if true is not None and true.sum() > FEWEST]
     counts, ious, start = Counter(), [], time.process_time()
+    outlines = Outlines(footage.shape, video.frame) if network else None
     for _ in range(count):
         i = shown[rng.integers(len(shown))]
         y, x = np.argwhere(film.truth[i])[rng.integers(film.truth[i].sum())] + 0.5
         prompt = FramePrompt(i, (PromptPoint(float(x), float(y)),))
-        soft = Image.fromarray(np.uint8(255 * prompted_mask(footage, scene, i, prompt).soft))
+        soft = Image.fromarray(
+            np.uint8(255 * clicked_mask(footage, scene, i, prompt, None, outlines).soft)
+        )
         mask = np.asarray(soft.resize((video.width, video.height), Image.Resampling.BILINEAR)) > 127
         word, iou = verdict(mask, film.truth[i], case.thin)
         counts[word] += 1
         ious.append(iou)
+    if outlines is not None:
+        outlines.close()
     row = {"case": name} | {k: counts[k] for k in ("right", "partial", "wrong", "empty")}
     seconds = time.process_time() - start
     return row | {"said": 0, "click": None, "iou": float(np.mean(ious)), "seconds": seconds}
 
 
-def run(name: str, cache: Path, sheet: Path | None) -> dict:
+def run(name: str, cache: Path, sheet: Path | None, network: bool) -> dict:
     case = CASES[name]
     film = footage_of(case, cache)
     at = case.click[0]
@@ -515,7 +522,7 @@ def run(name: str, cache: Path, sheet: Path | None) -> dict:
         start = time.process_time()
         row: dict = {"case": name}
         try:
-            found = ObjectTrackerEstimator().estimate(video).masks
+            found = ObjectTrackerEstimator(network=network).estimate(video).masks
         except Exception as error:  # a click on nothing is a result, too
             return row | {"error": str(error).splitlines()[0]}
         row["seconds"] = time.process_time() - start
@@ -578,6 +585,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--anywhere", type=int, help="random clicks in each video")
+    parser.add_argument("--network", action=argparse.BooleanOptionalAction, default=True)
     args = parser.parse_args()
     args.cache.mkdir(parents=True, exist_ok=True)
     names, rows, task, last = args.cases or list(CASES), [], run, args.sheet
@@ -589,7 +597,9 @@ def main() -> None:
     with ProcessPoolExecutor(args.jobs) as pool:
         recordings = {CASES[name].recording for name in names}
         list(pool.map(prepare, recordings, [args.cache] * len(recordings)))  # once each
-        for row in pool.map(task, names, [args.cache] * len(names), [last] * len(names)):
+        for row in pool.map(
+            task, names, *([x] * len(names) for x in (args.cache, last, args.network))
+        ):
             rows.append(row)
             if "error" in row:
                 print(f"| {row['case']} | {row['error']} |", flush=True)

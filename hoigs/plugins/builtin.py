@@ -194,7 +194,7 @@ PARTS = (
      "landmarks of a person by MediaPipe Pose, in an environment of its own"),
     ("estimator:object-tracker", "hoigs.plugins.estimators.object_tracker.estimator",
      "ObjectTrackerEstimator", "ObjectTrackerConfig",
-     "masks of objects from clicks, or of what moves beside the person; no network"),
+     "masks of objects from clicks, or of what moves beside the person"),
     ("estimator:command", "hoigs.plugins.estimators.command", "CommandEstimator",
      "CommandConfig",
      "masks, depth or landmarks that a command line of yours writes"),

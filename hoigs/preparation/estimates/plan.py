@@ -23,7 +23,7 @@ from hoigs.preparation.video.span import Span
 # three times as long before a camera that moves; those of networks are guesses
 COST = {
     "estimator:mediapipe": 0.3,
-    "estimator:object-tracker": 0.8,
+    "estimator:object-tracker": 1.8,
     "estimator:transformers-sam2": 4.0,
     "estimator:transformers-pose": 0.6,
     "estimator:transformers-depth": 1.5,

@@ -23,7 +23,9 @@ from hoigs.core.interfaces.estimator import (
 from hoigs.plugins.estimators.mediapipe.estimator import MediapipeEstimator
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage
 from hoigs.plugins.estimators.object_tracker.motion import BESIDE
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, prompted_mask
+from hoigs.plugins.estimators.object_tracker.outlined import clicked_mask
+from hoigs.plugins.estimators.object_tracker.outlines import Outlines
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask
 from hoigs.plugins.estimators.object_tracker.scene import (
     NEIGHBOURS,
     Scene,
@@ -111,6 +113,13 @@ class ClickMasks:
         self._scale = min(1.0, SIZE / max(video.width, video.height))
         width = round(video.width * self._scale)
         self.size = (width, max(1, round(video.height * width / video.width)))
+        self._outlines = (
+            Outlines((self.size[1], self.size[0]), video.rgb) if Outlines.installed() else None
+        )
+
+    def close(self) -> None:
+        if self._outlines is not None:
+            self._outlines.close()
 
     def survey(self) -> None:
         """Looks at the scene; the first mask does it otherwise."""
@@ -164,7 +173,9 @@ class ClickMasks:
         found = self._made_before.get(prompts)
         if found is None:
             colors = _colors(done) if done else None
-            found = prompted_mask(still.footage, still.scene, still.row, prompts[-1], colors)
+            found = clicked_mask(
+                still.footage, still.scene, still.row, prompts[-1], colors, self._outlines
+            )
             self._made_before[prompts] = found
             if len(self._made_before) > 2 * KEPT:
                 self._made_before.popitem(last=False)

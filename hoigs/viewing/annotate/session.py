@@ -178,6 +178,7 @@ class Session:
 
     def close(self) -> None:
         self.jobs.stop()
+        self.clicks.close()
         self.video.close()
 
     def about(self) -> dict[str, Any]:

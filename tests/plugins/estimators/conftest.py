@@ -1,10 +1,18 @@
-"""Tiny networks, made once for all tests of estimators that load them."""
+"""Tiny networks, made once for all tests of estimators that load them; no others are used."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+
+
+@pytest.fixture(autouse=True)
+def no_outlines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Objects are outlined alike on every machine, whatever is installed there."""
+    from hoigs.plugins.estimators.object_tracker.outlines import Outlines
+
+    monkeypatch.setattr(Outlines, "installed", staticmethod(lambda: False))
 
 
 def _fixture(name: str, builder: str):

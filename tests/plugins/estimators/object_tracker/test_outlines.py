@@ -1,0 +1,113 @@
+"""Objects outlined by a network: which of its masks is taken, and what becomes of those found."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from disc_world import H, W, click, masks_of, overlaps, request, world
+
+from hoigs.core.errors import HoigsError
+from hoigs.core.interfaces.estimator import FramePrompt
+from hoigs.plugins.estimators.object_tracker import outlines
+from hoigs.plugins.estimators.object_tracker.estimator import ObjectTrackerEstimator
+from hoigs.plugins.estimators.object_tracker.footage import read_footage
+from hoigs.plugins.estimators.object_tracker.outlined import clicked_mask
+from hoigs.plugins.estimators.object_tracker.outlines import HIGH, INSIDE, LOW, Outlines
+from hoigs.plugins.estimators.object_tracker.outlines_script import with_outputs
+from hoigs.plugins.estimators.object_tracker.prompts import overlap
+from hoigs.plugins.estimators.object_tracker.propagation import Track
+from hoigs.plugins.estimators.object_tracker.refined import refined
+from hoigs.plugins.estimators.object_tracker.scene import static_scene
+
+
+@pytest.fixture
+def fake(monkeypatch) -> None:
+    """A network that knows colours, run by this Python."""
+    monkeypatch.setattr(outlines, "SCRIPT", Path(__file__).with_name("fake_network.py"))
+    monkeypatch.setattr(Outlines, "installed", staticmethod(lambda: True))
+    monkeypatch.setattr(outlines, "_command", lambda: [sys.executable, "-I", str(outlines.SCRIPT)])
+
+
+def plain() -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
+    """The disc of one colour before a wall of another."""
+    _, people, discs = world()
+    frames = [np.full((H, W, 3), (120, 130, 90), np.uint8) for _ in discs]
+    for frame, person, disc in zip(frames, people, discs, strict=True):
+        frame[person], frame[disc] = (70, 80, 150), (230, 60, 50)
+    return frames, people, discs
+
+
+def test_pixels_are_those_of_the_frame_whatever_is_looked_at(fake) -> None:
+    frames, _, discs = plain()
+    large = [np.kron(f, np.ones((3, 3, 1), np.uint8)) for f in frames]  # read at another size
+    x, y = click(2).points[0].x, click(2).points[0].y
+    for box in (None, (x - 20, y - 20, x + 24, y + 16), (x - 30, y - 60, x + 90, y + 60)):
+        with Outlines((H, W), lambda i: large[i]) as network:
+            network.look(2, box)
+            (first, *_) = network.found([(x, y)], [INSIDE])
+            by_box = network.found([(x - 9, y - 9), (x + 9, y + 9)], [LOW, HIGH], discs[2])[0]
+        assert overlap(first.mask, discs[2]) > 0.85, box
+        assert np.array_equal(first.mask, by_box.mask) and first.quality == 0.9
+
+
+def test_a_click_takes_what_the_network_outlines_there(fake, tmp_path) -> None:
+    scene = plain()
+    video = request(tmp_path, scene)
+    footage = read_footage(video, scene[1])
+    prompt = click(3, click(3).points[0].x + 4)
+    x, y = click(3).points[0].x, click(3).points[0].y
+    box = FramePrompt(3, (), (x - 9, y - 9, x + 9, y + 9))
+    for asked in (prompt, box):
+        with Outlines(footage.shape, video.frame) as network:
+            found = clicked_mask(footage, static_scene(footage), 3, asked, None, network)
+        assert overlap(found.soft > 0.5, scene[2][3]) > 0.85
+        assert 0 < found.quality <= 1.5
+
+
+def test_followed_masks_are_outlined_again_where_the_network_sees_the_same(fake, tmp_path) -> None:
+    scene = plain()
+    video = request(tmp_path, scene)
+    footage = read_footage(video, scene[1])
+    soft = np.zeros((len(footage), H, W), np.uint8)
+    rough = [np.roll(d, 3, 1) for d in scene[2]]
+    for i in (1, 2, 3):
+        soft[i][rough[i]] = 255
+    soft[4][:4, :4] = 255  # of the wall, of which the network sees far more
+    with Outlines(footage.shape, video.frame) as network:
+        found = refined(footage, network, Track(soft, np.ones(len(footage)))).soft > 127
+    for i in (1, 2, 3):
+        assert overlap(found[i], scene[2][i]) > max(0.85, overlap(rough[i], scene[2][i]))
+    assert np.array_equal(found[4], soft[4] > 127)
+    assert not found[0].any()
+
+
+def test_the_tracker_uses_it_where_it_is_installed(fake, tmp_path) -> None:
+    scene = plain()
+    with_network = overlaps(masks_of(request(tmp_path / "a", scene, (click(3),))), scene[2])
+    assert np.median(with_network) > 0.85
+
+
+def test_a_network_that_is_wanted_and_absent_is_named(tmp_path) -> None:
+    with pytest.raises(HoigsError, match="hoigs estimators install mediapipe"):
+        ObjectTrackerEstimator(network=True).estimate(request(tmp_path, plain(), (click(3),)))
+
+
+def test_a_network_that_ends_says_what_it_said(fake) -> None:
+    with Outlines((H, W), lambda i: np.zeros((H, W, 3), np.uint8)) as network:
+        network.look(0, (0, 0, 20, 20))
+        with pytest.raises(HoigsError, match=r"ended with code 1.*\n.*is not in the picture"):
+            network.found([(90.0, 60.0)], [INSIDE])
+
+
+def test_further_outputs_are_merged_into_a_model() -> None:
+    """By the rules of Protocol Buffers alone: field 7 of the model, 12 of it, 1 of that."""
+    name = "a" * 200
+    added = with_outputs(b"", (name, "b"))
+    assert added[0] == 7 << 3 | 2
+    size, at = added[1] & 127 | added[2] << 7, 3
+    assert size == len(added) - at and added[at] == 12 << 3 | 2
+    assert added[at + 3] == 1 << 3 | 2 and added[at + 6 : at + 206] == name.encode()
+    assert added[at + 206 :] == b"\x62\x03\x0a\x01b"
