@@ -10,13 +10,14 @@ from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.behind import Behind
 from hoigs.plugins.estimators.object_tracker.footage import (
+    Footage,
     Window,
     bins_of,
     histogram,
     to_features,
 )
 from hoigs.plugins.estimators.object_tracker.path import Evidence, Path, center_of, found_path
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, walked
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, set_off, walked
 
 # Labels of pixels from frames in which they are known: by similar patches nearby.
 
@@ -339,3 +340,10 @@ def window_of(mask: Bool[np.ndarray, "h w"]) -> Window:
     y, x = np.nonzero(mask)
     half = 0.5 * max(np.ptp(x), np.ptp(y)) + 1
     return Window.around((x.min() + x.max() + 1) / 2, (y.min() + y.max() + 1) / 2, 1.5 * half + 8)
+
+
+def contrast(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
+    """How well a mask of one frame is set off (`prompts.set_off`), 0 to 1."""
+    window = window_of(mask)
+    colors, valid = window.cut(footage.colors(i)), window.inside(footage.shape)
+    return set_off(window.cut(mask) > 0.5, colors, bins_of(colors), valid)

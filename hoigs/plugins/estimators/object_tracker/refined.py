@@ -9,12 +9,11 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from hoigs.plugins.estimators.object_tracker.footage import Footage
-from hoigs.plugins.estimators.object_tracker.outlined import around, box_of
+from hoigs.plugins.estimators.object_tracker.outlined import SAME, around, box_of, sharper
 from hoigs.plugins.estimators.object_tracker.outlines import HIGH, LOW, Outline, Outlines
 from hoigs.plugins.estimators.object_tracker.prompts import overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 
-SAME = 0.5  # overlap with the followed mask from which an outline is of the same thing
 SURE = 0.7  # the network's own estimate from which an outline counts
 ROOM = 0.03  # of the longer side of the box about a mask, which may lack a rim
 
@@ -25,16 +24,23 @@ def refined(
     track: Track,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Track:
-    """The same object with sharper masks, where the network outlines one thing in the box about
-    its mask that is about this mask; in other frames as it was."""
-    soft = track.soft.copy()
-    shown = np.flatnonzero((track.soft > 127).any((1, 2))).tolist()
-    for done, i in enumerate(shown):
-        mask = track.soft[i] > 127
+    """The same object with masks that the network outlines, where it sees one thing in the box
+    about a mask that is about this mask; in other frames as it was. All of them as they were, if
+    those of the network are less well set off over the video."""
+    masks = {int(i): track.soft[i] > 127 for i in np.flatnonzero((track.soft > 127).any((1, 2)))}
+    found = {}
+    for done, (i, mask) in enumerate(masks.items()):
         better = again(footage, outlines, i, mask)
         if better is not None:
-            soft[i] = np.rint(255 * better)
-        progress((done + 1) / len(shown))
+            found[i] = better
+        progress((done + 1) / len(masks))
+    if not found or not sharper(
+        footage, {i: masks[i] for i in found}, {i: soft > 0.5 for i, soft in found.items()}
+    ):
+        return track
+    soft = track.soft.copy()
+    for i, better in found.items():
+        soft[i] = np.rint(255 * better)
     return Track(soft, track.confidence)
 
 

@@ -28,8 +28,8 @@ from hoigs.plugins.estimators.object_tracker.path import (
     found_path,
     path_of,
 )
-from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap, set_off
-from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, window_of
+from hoigs.plugins.estimators.object_tracker.prompts import PromptedMask, overlap
+from hoigs.plugins.estimators.object_tracker.propagation import Propagation, Track, contrast
 from hoigs.plugins.estimators.object_tracker.scene import MovingScene, Scene, StaticScene, median_of
 from hoigs.plugins.estimators.object_tracker.states import LOST
 from hoigs.plugins.estimators.object_tracker.unexplained import completed
@@ -81,14 +81,8 @@ def _quality(footage: Footage, track: Track) -> Float[np.ndarray, " F"]:
         usual = np.nanmedian(seen[max(0, i - reach) : i + reach + 1])
         size = min(area[i], usual) / max(area[i], usual)
         body = (footage.body(i) & masks[i]).sum() / area[i]
-        found[i] = track.confidence[i] * _set_off(footage, i, masks[i]) * size**2 * (1 - 0.5 * body)
+        found[i] = track.confidence[i] * contrast(footage, i, masks[i]) * size**2 * (1 - 0.5 * body)
     return found
-
-
-def _set_off(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> float:
-    window = window_of(mask)
-    colors, valid = window.cut(footage.colors(i)), window.inside(footage.shape)
-    return set_off(window.cut(mask) > 0.5, colors, bins_of(colors), valid)
 
 
 SAME = 0.7  # intersection over union from which two passes agree on a frame

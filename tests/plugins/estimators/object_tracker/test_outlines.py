@@ -90,6 +90,18 @@ def test_the_tracker_uses_it_where_it_is_installed(fake, tmp_path) -> None:
     assert np.median(with_network) > 0.85
 
 
+@pytest.mark.skipif(not Outlines.installed(), reason="needs `hoigs estimators install mediapipe`")
+def test_the_network_itself_outlines_a_disc() -> None:
+    frames, _, discs = plain()
+    x, y = click(2).points[0].x, click(2).points[0].y
+    with Outlines((H, W), lambda i: frames[i]) as network:
+        network.look(2)
+        by_point = network.found([(x, y)], [INSIDE])
+        by_box = network.found([(x - 9, y - 9), (x + 9, y + 9)], [LOW, HIGH], discs[2])[0]
+    assert max(overlap(one.mask, discs[2]) for one in by_point) > 0.85
+    assert overlap(by_box.mask, discs[2]) > 0.85 and by_box.quality > 0.7
+
+
 def test_a_network_that_is_wanted_and_absent_is_named(tmp_path) -> None:
     with pytest.raises(HoigsError, match="hoigs estimators install mediapipe"):
         ObjectTrackerEstimator(network=True).estimate(request(tmp_path, plain(), (click(3),)))
