@@ -220,18 +220,18 @@ def _write(path: Path, text: str) -> None:
 def test_killed_at_random_moments() -> None:
     """Real processes, real SIGKILLs; benchmarks/kill_prepare.py does it as often as one likes."""
     done = subprocess.run(
-        [sys.executable, str(KILL), "--times", "5", "--seed", "3"],
+        [sys.executable, str(KILL), "--times", "3", "--seed", "3"],
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    match = re.match(r"5 kills in runs of .* (\d+) clips finished, (\d+) of them", done.stdout)
+    match = re.match(r"3 kills in runs of .* (\d+) clips finished, (\d+) of them", done.stdout)
     assert match and int(match[1]) >= 1, done.stdout
 
 
 def test_killed_while_its_environment_is_installed() -> None:
     done = subprocess.run(
-        [sys.executable, str(KILL), "--install", "--times", "2", "--seed", "0"],
+        [sys.executable, str(KILL), "--install", "--times", "1", "--seed", "0"],
         capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert re.search(r"2 kills in runs of .* [1-9]\d* clips finished", done.stdout), done.stdout
+    assert re.search(r"1 kills? in runs of .* [1-9]\d* clips finished", done.stdout), done.stdout
