@@ -81,9 +81,9 @@ def clicked_mask(
         known: the object's colours in other frames. outlines: None: there is no network.
     """
     grown = prompted_mask(footage, scene, i, prompt, known)
-    if outlines is None:
-        return grown
     number, (inside, outside, box) = footage.numbers[i], scaled(prompt, footage)
+    if outlines is None or not all(_shown(footage, i, x, y) for x, y in inside):
+        return grown
     points = [*map(tuple, inside), *map(tuple, outside)]
     labels = [INSIDE] * len(inside) + [OUTSIDE] * len(outside)
     seen = _looked(outlines, number, points, labels) if box is None else []
@@ -95,6 +95,12 @@ def clicked_mask(
         corners = [(x0, y0), (x1, y1)]
         seen.append(_Seen(-1, outlines.found([*points, *corners], [*labels, LOW, HIGH])[0]))
     return _best(footage, scene, grown, seen, SURE if prompt.box else LEAST)
+
+
+def _shown(footage: Footage, i: int, x: float, y: float) -> bool:
+    """Whether a point is in the picture, and not on a black border of it."""
+    h, w = footage.shape
+    return 0 <= x < w and 0 <= y < h and not footage.blank[i, int(y), int(x)]
 
 
 def _looked(

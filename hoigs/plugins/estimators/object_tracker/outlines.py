@@ -23,7 +23,6 @@ from hoigs.plugins.estimators.tools import DECODER, ENCODER, MEDIAPIPE, TAIL
 SCRIPT = Path(__file__).with_name("outlines_script.py")
 SIDE, CELLS, PER_CELL = 1024, 256, 4  # pixels of what the network sees, cells of its masks
 INSIDE, OUTSIDE, LOW, HIGH, NOTHING = 1, 0, 2, 3, -1  # labels of points
-CERTAIN = 10.0  # log-odds that a prior mask is given
 LARGEST = 20.0  # log-odds of a mask
 
 Box = tuple[float, float, float, float]  # x0, y0, x1, y1
@@ -129,18 +128,12 @@ class Outlines:
         shown = np.asarray(part)
         self._ask({"image": shown.shape[:2]}, shown.tobytes())
 
-    def found(
-        self,
-        points: Sequence[tuple[float, float]],
-        labels: Sequence[int],
-        prior: Bool[np.ndarray, "h w"] | None = None,
-    ) -> list[Outline]:
+    def found(self, points: Sequence[tuple[float, float]], labels: Sequence[int]) -> list[Outline]:
         """Four masks in what was shown: the first where the question is clear, as by a box, and
         else what is meant as a part, a whole or a group.
 
         Args:
             points: pixels of `shape`. labels: what each is, as INSIDE.
-            prior: a mask that is about right.
         """
         assert self._view is not None
         view = self._view
@@ -148,8 +141,7 @@ class Outlines:
         labels = list(labels)
         if LOW not in labels:
             at, labels = [*at, (0.0, 0.0)], [*labels, NOTHING]
-        raw = b"" if prior is None else self._cells(prior).tobytes()
-        self._ask({"points": at, "labels": labels, "prior": prior is not None}, raw)
+        self._ask({"points": at, "labels": labels})
         assert self._process is not None and self._process.stdout is not None
         line = self._process.stdout.readline()
         size = 4 * CELLS * CELLS * 2
@@ -172,20 +164,7 @@ class Outlines:
         )
         return odds.clip(-LARGEST, LARGEST)
 
-    def _cells(self, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "n n"]:
-        """A mask of a frame as the network takes it."""
-        view = self._view
-        assert view is not None
-        part = mask[view.y : view.y + view.height, view.x : view.x + view.width]
-        rows, columns = view.cells
-        small = Image.fromarray(part.astype(np.float32)).resize(
-            (columns, rows), Image.Resampling.BOX
-        )
-        cells = np.full((CELLS, CELLS), -CERTAIN, np.float32)
-        cells[:rows, :columns] = CERTAIN * (2 * np.asarray(small) - 1)
-        return cells
-
-    def _ask(self, request: dict[str, Any], raw: bytes) -> None:
+    def _ask(self, request: dict[str, Any], raw: bytes = b"") -> None:
         process = self._process or self._started()
         assert process.stdin is not None
         try:

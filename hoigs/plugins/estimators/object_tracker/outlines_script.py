@@ -4,10 +4,9 @@ Answers requests from standard input, a line of JSON and then raw bytes each, on
 
 - `{"image": [height, width]}` and RGB bytes, the longer side 1024: the picture is encoded, which
   takes about a second; nothing is answered.
-- `{"points": [[x, y], ...], "labels": [...], "prior": bool}` and, if there is one, 256x256 float32
-  logits: the last picture's four masks, as a line with their expected overlaps and float16 logits
-  [4, 256, 256] of a square whose side the picture's longer one is. Labels: 1 inside, 0 outside,
-  2 and 3 the corners of a box, -1 nothing.
+- `{"points": [[x, y], ...], "labels": [...]}`: the last picture's four masks, as a line with their
+  expected overlaps and float16 logits [4, 256, 256] of a square whose side the picture's longer one
+  is. Labels: 1 inside, 0 outside, 2 and 3 the corners of a box, -1 nothing.
 """
 
 from __future__ import annotations
@@ -56,17 +55,14 @@ def main() -> None:
 
 
 def answered(decoder: Any, seen: Any, request: dict[str, Any]) -> Any:
-    prior = np.zeros((1, 1, CELLS, CELLS), np.float32)
-    if request["prior"]:
-        prior = np.frombuffer(read(prior.nbytes), np.float32).reshape(prior.shape)
     return decoder.run(
         [LOGITS, OVERLAPS],
         {
             "image_embeddings": seen,
             "point_coords": np.array([request["points"]], np.float32),
             "point_labels": np.array([request["labels"]], np.float32),
-            "mask_input": prior,
-            "has_mask_input": np.array([request["prior"]], np.float32),
+            "mask_input": np.zeros((1, 1, CELLS, CELLS), np.float32),
+            "has_mask_input": np.zeros(1, np.float32),
             "orig_im_size": np.array((CELLS, CELLS), np.float32),
         },
     )

@@ -48,7 +48,7 @@ def test_pixels_are_those_of_the_frame_whatever_is_looked_at(fake) -> None:
         with Outlines((H, W), lambda i: large[i]) as network:
             network.look(2, box)
             (first, *_) = network.found([(x, y)], [INSIDE])
-            by_box = network.found([(x - 9, y - 9), (x + 9, y + 9)], [LOW, HIGH], discs[2])[0]
+            by_box = network.found([(x - 9, y - 9), (x + 9, y + 9)], [LOW, HIGH])[0]
         assert overlap(first.mask, discs[2]) > 0.85, box
         assert np.array_equal(first.mask, by_box.mask) and first.quality == 0.9
 
@@ -65,6 +65,20 @@ def test_a_click_takes_what_the_network_outlines_there(fake, tmp_path) -> None:
             found = clicked_mask(footage, static_scene(footage), 3, asked, None, network)
         assert overlap(found.soft > 0.5, scene[2][3]) > 0.85
         assert 0 < found.quality <= 1.5
+
+
+def test_beside_the_picture_and_on_its_black_border_the_network_is_not_asked(
+    fake, tmp_path
+) -> None:
+    scene = plain()
+    for frame in scene[0]:
+        frame[:12] = 0
+    video = request(tmp_path, scene)
+    footage = read_footage(video, scene[1])
+    for x, y in ((W + 30.0, 20.0), (50.0, 5.0)):
+        with Outlines(footage.shape, video.frame) as network:
+            found = clicked_mask(footage, static_scene(footage), 3, click(3, x, y), None, network)
+        assert not (found.soft > 0.5).any()
 
 
 def test_followed_masks_are_outlined_again_where_the_network_sees_the_same(fake, tmp_path) -> None:
@@ -97,7 +111,7 @@ def test_the_network_itself_outlines_a_disc() -> None:
     with Outlines((H, W), lambda i: frames[i]) as network:
         network.look(2)
         by_point = network.found([(x, y)], [INSIDE])
-        by_box = network.found([(x - 9, y - 9), (x + 9, y + 9)], [LOW, HIGH], discs[2])[0]
+        by_box = network.found([(x - 9, y - 9), (x + 9, y + 9)], [LOW, HIGH])[0]
     assert max(overlap(one.mask, discs[2]) for one in by_point) > 0.85
     assert overlap(by_box.mask, discs[2]) > 0.85 and by_box.quality > 0.7
 
