@@ -116,8 +116,10 @@ class ManagedEnvironment:
 
     def file(self, file: NpmFile) -> Path | None:
         """Where one of its files lies; None where the environment or the file is absent."""
-        path = _site_packages(self.folder) / file.to if self.installed else None
-        return path if path is not None and path.is_file() else None
+        if not self.installed:
+            return None
+        paths = [packages / file.to for packages in _site_packages(self.folder)]
+        return next((path for path in paths if path.is_file()), None)
 
     def lacking(self) -> dict[str, str]:
         """Files that could not be had, and why."""
@@ -198,7 +200,7 @@ class ManagedEnvironment:
         lacking = {}
         packages: dict[str, bytes] = {}
         for file in self.files:
-            target = _site_packages(folder) / file.to
+            target = _site_packages(folder)[0] / file.to
             if target.is_file():
                 continue
             progress(0.9, f"installing {self.name}: {file.member}")
@@ -227,10 +229,10 @@ def _python_of(folder: Path) -> Path:
     return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def _site_packages(folder: Path) -> Path:
+def _site_packages(folder: Path) -> list[Path]:
     if os.name == "nt":
-        return folder / "Lib" / "site-packages"
-    return next((folder / "lib").glob("python*")) / "site-packages"
+        return [folder / "Lib" / "site-packages"]
+    return [found / "site-packages" for found in (folder / "lib").glob("python*")]
 
 
 def _run(argv: Sequence[str], what: str) -> str:

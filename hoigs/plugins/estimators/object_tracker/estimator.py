@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from jaxtyping import Bool
 from pydantic import Field
 
 from hoigs.core.config import ComponentConfig
@@ -132,7 +133,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 33  # of what is kept in `work`; raised when masks change
+VERSION = 34  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -301,14 +302,18 @@ class ObjectTrackerEstimator(Estimator):
             done += share
         others = {n: [] if n in equal or n in rods else masks for n, masks in prompts.items()}
         tracks, alike = told_apart(footage, scene, others, {e.name: tracks[e.name] for e in wanted})
+        led: dict[str, Bool[np.ndarray, " F"]] = {}
         if outlines is not None:
             for k, (name, track) in enumerate(tracks.items()):
                 if track is not None and name not in rods:
                     part = _part(
                         progress, ends + k * (1 - ends) / len(wanted), (1 - ends) / len(wanted)
                     )
-                    tracks[name] = refined(footage, outlines, track, part)
-        vague = [n for n, s in states_of(footage, tracks).items() if mostly_doubtful(s)]
+                    clicked = [] if name in chosen else [p.frame for p in prompts[name]]
+                    better = refined(footage, outlines, track, clicked, part)
+                    tracks[name], led[name] = better.track, better.led
+        states = states_of(footage, tracks, led)
+        vague = [n for n, s in states.items() if mostly_doubtful(s)]
         taken = {n: t.soft > 127 for n, t in tracks.items() if n in chosen and t is not None}
         shirts = [n for n, m in taken.items() if n not in vague and covers_torso(m, people)]
         bare = [
@@ -317,10 +322,10 @@ class ObjectTrackerEstimator(Estimator):
             if n not in (*vague, *shirts) and looks_like_skin(footage, m, people)
         ]
         tracks |= dict.fromkeys((*vague, *shirts, *bare))
-        states = states_of(footage, tracks)
+        states = states_of(footage, tracks, led)
         worn = [n for n, t in tracks.items() if n in chosen and t and is_worn(t.soft > 127, people)]
-        clicked = [n for n, m in prompts.items() if m and n not in chosen]
-        faint = [n for n in clicked if all(_looks_like_scenery(scene, p) for p in prompts[n])]
+        own = [n for n, m in prompts.items() if m and n not in chosen]
+        faint = [n for n in own if all(_looks_like_scenery(scene, p) for p in prompts[n])]
         scenery = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
         states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *scenery)}
         why = ((vague, VAGUE), (shirts, SHIRT), (bare, SKIN), (worn, CLOTHES))

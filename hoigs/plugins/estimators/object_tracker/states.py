@@ -41,7 +41,11 @@ COVERED = 0.5  # share of its place from which something hides it
 SAME_PLACE = 1.5  # breadths between the sightings around a gap, up to which it stayed about there
 
 
-def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str, list[str]]:
+def states_of(
+    footage: Footage,
+    tracks: Mapping[str, Track | None],
+    led: Mapping[str, Bool[np.ndarray, " F"]] | None = None,
+) -> dict[str, list[str]]:
     """The state of each object in each frame.
 
     An object that moved over the edge of the picture where it was last seen, or moves in where it
@@ -49,6 +53,9 @@ def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str,
     person or another object covers meanwhile, is hidden. Of all else nothing is known: it is lost.
     A mask on a person whose colours the rest of them has, too, is doubtful: a hand that held the
     object, or a shirt.
+
+    Args:
+        led: of each object, frames in which it is certain whatever colours it has.
     """
     masks = {name: None if t is None else t.soft > 127 for name, t in tracks.items()}
     found = {}
@@ -58,8 +65,13 @@ def states_of(footage: Footage, tracks: Mapping[str, Track | None]) -> dict[str,
             continue
         others = {n: m for n, m in masks.items() if n != name and m is not None}
         seen = np.flatnonzero(own.any((1, 2)))
-        states = [LOST if not m.any() else DOUBTFUL if lies_on_people(footage, i, m, OF_PERSON)
-                  else SEEN for i, m in enumerate(own)]  # fmt: skip
+        certain = (led or {}).get(name, np.zeros(len(footage), bool))
+        states = [
+            LOST if not m.any()
+            else DOUBTFUL if not certain[i] and lies_on_people(footage, i, m, OF_PERSON)
+            else SEEN
+            for i, m in enumerate(own)
+        ]  # fmt: skip
         for i in np.flatnonzero(~own.any((1, 2))).tolist():
             around = [*seen[seen < i][-1:], *seen[seen > i][:1]]
             if _left(own, seen[seen < i][::-1], i) or _left(own, seen[seen > i], i):

@@ -21,6 +21,7 @@ from hoigs.plugins.estimators.object_tracker.prompts import overlap
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.refined import refined
 from hoigs.plugins.estimators.object_tracker.scene import static_scene
+from hoigs.plugins.estimators.object_tracker.states import DOUBTFUL, SEEN, states_of
 
 
 @pytest.fixture
@@ -91,11 +92,53 @@ def test_followed_masks_are_outlined_again_where_the_network_sees_the_same(fake,
         soft[i][rough[i]] = 255
     soft[4][:4, :4] = 255  # of the wall, of which the network sees far more
     with Outlines(footage.shape, video.frame) as network:
-        found = refined(footage, network, Track(soft, np.ones(len(footage)))).soft > 127
+        found = refined(footage, network, Track(soft, np.ones(len(footage))), ()).track.soft > 127
     for i in (1, 2, 3):
         assert overlap(found[i], scene[2][i]) > max(0.85, overlap(rough[i], scene[2][i]))
     assert np.array_equal(found[4], soft[4] > 127)
     assert not found[0].any()
+
+
+def test_outlines_lead_from_a_mask_to_the_next_through_frames_without(fake, tmp_path) -> None:
+    frames, people, discs = plain()
+    slow = [np.roll(discs[2], i // 2, 1) for i in range(len(discs))]  # it hardly moves
+    for frame, disc, person in zip(frames, slow, people, strict=True):
+        frame[:] = (120, 130, 90)
+        frame[person & ~disc], frame[disc] = (70, 80, 150), (230, 60, 50)
+    frames[9][:] = (120, 130, 90)  # it is gone for a moment
+    video = request(tmp_path, (frames, people, slow))
+    footage = read_footage(video, people)
+    soft = np.zeros((len(footage), H, W), np.uint8)
+    for i in (1, 6, 11):
+        soft[i][slow[i]] = 255
+    with Outlines(footage.shape, video.frame) as network:
+        better = refined(footage, network, Track(soft, 0.8 * soft.any((1, 2))), (6,))
+    found = better.track.soft > 127
+    for i in range(1, 7):
+        assert overlap(found[i], slow[i]) > 0.85
+    assert not found[[0, 7, 8, 9, 10, 12, 13]].any()
+    assert np.array_equal(np.flatnonzero(better.led), np.arange(1, 7))  # of the click in 6
+
+
+def test_what_outlines_lead_to_from_a_click_is_seen_whatever_colours_it_has(tmp_path) -> None:
+    """A box before a shirt of its colour: by colours alone it may be the shirt."""
+    frames, people, _ = plain()
+    boxes = [np.zeros((H, W), bool) for _ in frames]
+    for i, (frame, person, box) in enumerate(zip(frames, people, boxes, strict=True)):
+        box[40:52, 44 + i // 3 : 58 + i // 3] = True
+        frame[:] = (120, 130, 90)
+        frame[person | box] = (70, 80, 150)
+        frame[box] = (150, 20, 20)  # and the rest of the person has as much of it
+        frame[person & ~box & (np.arange(H)[:, None] > 54)] = (150, 20, 20)
+        person |= box
+    video = request(tmp_path, (frames, people, boxes))
+    footage = read_footage(video, people)
+    track = Track(np.stack(boxes).astype(np.uint8) * 255, np.ones(len(footage)))
+    doubted = states_of(footage, {"object": track})["object"]
+    assert doubted.count(DOUBTFUL) > len(footage) / 2
+    led = {"object": np.arange(len(footage)) < 9}
+    states = states_of(footage, {"object": track}, led)["object"]
+    assert set(states[:9]) == {SEEN} and states[9:] == doubted[9:]
 
 
 def test_the_tracker_uses_it_where_it_is_installed(fake, tmp_path) -> None:
