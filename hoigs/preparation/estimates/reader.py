@@ -408,8 +408,7 @@ def _all_of(stacks: Sequence[MaskStack]) -> MaskStack | None:
 
 def identity(estimator: Estimator) -> list[str]:
     """An estimator and its settings, as a key of its results."""
-    settings = sorted((name, repr(value)) for name, value in vars(estimator).items())
-    return [f"{type(estimator).__module__}:{type(estimator).__qualname__}", repr(settings)]
+    return [f"{type(estimator).__module__}:{type(estimator).__qualname__}", repr(estimator)]
 
 
 def paths_of(estimator: Estimator, folder: Path) -> list[Path]:

@@ -184,6 +184,10 @@ class ObjectTrackerEstimator(Estimator):
     config: ObjectTrackerConfig
     provides = frozenset({"masks"})
 
+    def __repr__(self) -> str:
+        """With whether the network is there: what was found without it is found anew."""
+        return f"{super().__repr__()[:-1]}, installed={Outlines.installed()})"
+
     def estimate(self, video: VideoRequest, progress: Progress = no_progress) -> Estimates:
         wanted = [e for e in video.entities if e.kind == "object"]
         wanted = wanted or [EntityRequest("object")]

@@ -22,6 +22,7 @@ from hoigs.plugins.estimators.object_tracker.propagation import Track
 from hoigs.plugins.estimators.object_tracker.refined import refined
 from hoigs.plugins.estimators.object_tracker.scene import static_scene
 from hoigs.plugins.estimators.object_tracker.states import DOUBTFUL, SEEN, states_of
+from hoigs.preparation.estimates.reader import identity
 
 
 @pytest.fixture
@@ -157,6 +158,14 @@ def test_the_network_itself_outlines_a_disc() -> None:
         by_box = network.found([(x - 9, y - 9), (x + 9, y + 9)], [LOW, HIGH])[0]
     assert max(overlap(one.mask, discs[2]) for one in by_point) > 0.85
     assert overlap(by_box.mask, discs[2]) > 0.85 and by_box.quality > 0.7
+
+
+def test_what_was_found_without_it_is_found_anew_with_it(monkeypatch) -> None:
+    names = []
+    for installed in (False, True):
+        monkeypatch.setattr(Outlines, "installed", staticmethod(lambda there=installed: there))
+        names.append(identity(ObjectTrackerEstimator()))
+    assert names[0] != names[1] and names[1] == identity(ObjectTrackerEstimator())
 
 
 def test_a_network_that_is_wanted_and_absent_is_named(tmp_path) -> None:
