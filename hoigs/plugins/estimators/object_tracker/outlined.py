@@ -60,7 +60,7 @@ AS_GROWN = 0.3  # by how much better the mask is that grew by colours and edges
 
 @dataclass(frozen=True)
 class _Seen:
-    """look: in which of the looks; -1: in one of its own."""
+    """An outline, and which of the looks shows it; -1: one of its own."""
 
     look: int
     outline: Outline
@@ -82,7 +82,8 @@ def clicked_mask(
     """
     grown = prompted_mask(footage, scene, i, prompt, known)
     number, (inside, outside, box) = footage.numbers[i], scaled(prompt, footage)
-    if outlines is None or not all(_shown(footage, i, x, y) for x, y in inside):
+    asked = box is not None or len(inside)
+    if outlines is None or not asked or not all(_shown(footage, i, x, y) for x, y in inside):
         return grown
     points = [*map(tuple, inside), *map(tuple, outside)]
     labels = [INSIDE] * len(inside) + [OUTSIDE] * len(outside)
@@ -153,9 +154,13 @@ def sharper(
     masks: Mapping[int, Bool[np.ndarray, "h w"]],
     again: Mapping[int, Bool[np.ndarray, "h w"]],
 ) -> bool:
-    """Whether masks of the network, by frame, are as well set off as those of the same thing that
-    follow the pixels: it leaves out what is thin, such as the handle of a cup, but knows an edge
-    between like colours."""
+    """Whether the network's masks of a thing are as well set off, in the mean over frames, as those
+    that follow the pixels. The network leaves out what is thin, such as the handle of a cup, but
+    knows an edge between like colours.
+
+    Args:
+        masks: by frame, those that follow the pixels. again: the network's, in the same frames.
+    """
     gained = [contrast(footage, i, again[i]) - contrast(footage, i, masks[i]) for i in masks]
     return float(np.mean(gained)) > -DULLER
 
@@ -197,6 +202,7 @@ def _has(
 
 
 def box_of(mask: Bool[np.ndarray, "h w"]) -> Box:
+    """The box about a mask that is not empty, pixels."""
     rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
     return (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
 
