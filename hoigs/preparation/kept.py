@@ -62,7 +62,7 @@ PLAN = {
         version=6,
     ),
     "object_masks": Stage(
-        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=15
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=16
     ),
     "cameras": Stage(
         3,

@@ -133,7 +133,7 @@ def _ranges(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} frame{'s' if len(numbers) > 1 else ''} ({', '.join(texts)}{more})"
 
 
-VERSION = 34  # of what is kept in `work`; raised when masks change
+VERSION = 35  # of what is kept in `work`; raised when masks change
 VAGUE = (
     "most of what was found lies on a person and has their colours, and is dropped: click on it "
     "in a frame that shows it beside them, or give a box"
@@ -314,7 +314,7 @@ class ObjectTrackerEstimator(Estimator):
                         progress, ends + k * (1 - ends) / len(wanted), (1 - ends) / len(wanted)
                     )
                     clicked = [] if name in chosen else [p.frame for p in prompts[name]]
-                    better = refined(footage, outlines, track, clicked, part)
+                    better = refined(footage, outlines, track, clicked, name in equal, part)
                     tracks[name], led[name] = better.track, better.led
         states = states_of(footage, tracks, led)
         vague = [n for n, s in states.items() if mostly_doubtful(s)]

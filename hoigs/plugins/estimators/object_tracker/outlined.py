@@ -51,6 +51,8 @@ SAME = 0.5  # overlap from which two masks are of the same thing
 DULLER = 0.02  # by how much less the network's masks may be set off
 LEAST = 1.4  # score of a mask from which the network knows what was clicked
 SURE = 0.5  # the network's own estimate from which an outline may be one
+JOINTS = (13, 14, 15, 16, 25, 26, 27, 28)  # elbows, wrists, knees, ankles
+BESIDE = 0.01  # of the diagonal: what is nearer to a click may be on the object
 HEAD, HANDS = tuple(range(11)), ((15, 17, 19, 21), (16, 18, 20, 22))  # landmarks
 # by how much worse a mask is that has a whole head, that has a whole hand and all colours of limbs,
 # and that looks like the person it lies on
@@ -87,7 +89,8 @@ def clicked_mask(
         return grown
     points = [*map(tuple, inside), *map(tuple, outside)]
     labels = [INSIDE] * len(inside) + [OUTSIDE] * len(outside)
-    seen = _looked(outlines, number, points, labels) if box is None else []
+    joints = _joints(footage, i, inside) if grown.on_person else []
+    seen = _looked(outlines, number, points, labels, joints) if box is None else []
     if box is None and (mask := grown.soft > 0.5).any():
         box = box_of(mask)
     if box is not None:
@@ -104,10 +107,24 @@ def _shown(footage: Footage, i: int, x: float, y: float) -> bool:
     return 0 <= x < w and 0 <= y < h and not footage.blank[i, int(y), int(x)]
 
 
+def _joints(
+    footage: Footage, i: int, clicks: Float[np.ndarray, "N 2"]
+) -> list[tuple[float, float]]:
+    """Joints of limbs that are seen, x, y, and are not next to a click."""
+    found = []
+    for person in footage.people:
+        for x, y, _, visible in person[i, list(JOINTS)].tolist():
+            if visible > SEEN and np.hypot(*(clicks - (x, y)).T).min() > BESIDE * footage.diagonal:
+                found.append((x, y))
+    return found
+
+
 def _looked(
-    outlines: Outlines, number: int, points: Sequence[tuple[float, float]], labels: Sequence[int]
-) -> list[_Seen]:
-    """Three masks of each look at what is around the clicks: a part, a whole, a group."""
+    outlines: Outlines, number: int, points: Sequence[tuple[float, float]], labels: Sequence[int],
+    joints: Sequence[tuple[float, float]],
+) -> list[_Seen]:  # fmt: skip
+    """Three masks of each look at what is around the clicks: a part, a whole, a group; and these
+    without a person's joints."""
     h, w = outlines.shape
     middle = np.mean([p for p, label in zip(points, labels, strict=True) if label == INSIDE], 0)
     spread = max(np.ptp([p[0] for p in points]), np.ptp([p[1] for p in points]))
@@ -117,6 +134,11 @@ def _looked(
         box = (middle[0] - half, middle[1] - half, middle[0] + half, middle[1] + half)
         outlines.look(number, None if share == 1 else within(box, (h, w)))
         found += [_Seen(k, outline) for outline in outlines.found(points, labels)[1:]]
+        x0, y0, x1, y1 = (0, 0, w, h) if share == 1 else within(box, (h, w))
+        off = [(x, y) for x, y in joints if x0 < x < x1 and y0 < y < y1]
+        if off:
+            without = outlines.found([*points, *off], [*labels, *[OUTSIDE] * len(off)])
+            found += [_Seen(k, outline) for outline in without]
     return found
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from hoigs.plugins.estimators.object_tracker.footage import Footage
+from hoigs.plugins.estimators.object_tracker.footage import Footage, bins_of, histogram
+from hoigs.plugins.estimators.object_tracker.motion import moved_on
 from hoigs.plugins.estimators.object_tracker.outlined import SAME, around, box_of, sharper
 from hoigs.plugins.estimators.object_tracker.outlines import HIGH, LOW, Outline, Outlines
 from hoigs.plugins.estimators.object_tracker.path import center_of
@@ -39,17 +40,26 @@ def refined(
     outlines: Outlines,
     track: Track,
     clicked: Collection[int],
+    rivals: bool = False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Refined:
     """The same object with masks that the network outlines, in more frames.
 
     Args:
-        clicked: frames in which it is known.
+        clicked: frames in which it is known. rivals: whether other things look the same, so that
+            only frames between those that show it are filled.
     """
-    found = _outlined(footage, outlines, track, lambda share: progress(0.8 * share))
+    found = _outlined(footage, outlines, track, lambda share: progress(0.7 * share))
     better = _sharpened(footage, track, found)
-    better, more = _bridged(footage, outlines, better, lambda share: progress(0.8 + 0.2 * share))
-    return Refined(better, _led({**found, **more}, clicked, len(footage)))
+    better, other = _steadied(footage, outlines, better)
+    better, more = _bridged(footage, outlines, better, lambda share: progress(0.7 + 0.1 * share))
+    beyond: Outlined = {}
+    ways: dict[int, int] = {}
+    if not rivals:
+        better, beyond, ways = _carried_on(
+            footage, outlines, better, lambda share: progress(0.8 + 0.2 * share)
+        )
+    return Refined(better, _led(found | other | more | beyond, clicked, ways, len(footage)))
 
 
 Outlined = dict[int, Float[np.ndarray, "h w"]]  # soft masks of the network by frame
@@ -81,6 +91,25 @@ def _sharpened(footage: Footage, track: Track, found: Outlined) -> Track:
 
 
 STEADY = 0.7  # overlap of a thing's outlines in one frame and the next, about their middles
+
+
+def _steadied(footage: Footage, outlines: Outlines, track: Track) -> tuple[Track, Outlined]:
+    """The same object with an outline like those of the two frames beside it, where these show the
+    same shape and its mask is another; and these outlines. A clicked frame may be such: it is the
+    one that nothing else explains."""
+    masks, soft = track.soft > 127, track.soft.copy()
+    found: Outlined = {}
+    shown, last = masks.any((1, 2)), len(masks) - 1
+    for i in np.flatnonzero(shown).tolist() if last > 1 else ():
+        a, b = (i - 1, i + 1) if 0 < i < last else (1, 2) if i == 0 else (last - 1, last - 2)
+        if not _steady(masks[a], masks[b]) or _steady(masks[i], masks[a]):
+            continue
+        outline = again(footage, outlines, i, masks[a])
+        if outline is not None and _steady(outline > 0.5, masks[a]):
+            soft[i], found[i] = np.rint(255 * outline), outline
+    return Track(soft, track.confidence), found
+
+
 LONGEST = 60  # frames without a mask that outlines may lead through
 
 
@@ -109,17 +138,110 @@ def _bridged(
     return Track(soft, confidence), found
 
 
-def _led(found: Outlined, clicked: Collection[int], count: int) -> Bool[np.ndarray, " F"]:
+# Of an outline in a frame without a mask: the network's own estimate, the share of it that is where
+# the object went, their overlap, and the likeness of its colours and those of the object.
+SURER, WITHIN, LEFT, LIKE = 0.85, 0.8, 0.35, 0.6
+WHOLE = 0.88  # ratio of areas from which an outline shows all of the object
+
+
+def _carried_on(
+    footage: Footage, outlines: Outlines, track: Track, progress: Callable[[float], None]
+) -> tuple[Track, Outlined, dict[int, int]]:
+    """The same object in frames next to those that show it, too, as far as outlines are where its
+    motion carries it, such as the part of it that a hand leaves free; these outlines; and of each
+    the way that led to it, 1 from the frame before and -1 from the next."""
+    soft, confidence = track.soft.copy(), track.confidence.copy()
+    shown = np.flatnonzero((track.soft > 127).any((1, 2))).tolist()
+    if not shown:
+        return track, {}, {}
+    usual = np.sqrt(np.mean([_colors(footage, i, soft[i] > 127) for i in shown], axis=0))
+    found: Outlined = {}
+    ways: dict[int, int] = {}
+    for done, (start, step) in enumerate(product(shown, (1, -1))):
+        i, whole = start, soft[start] > 127
+        while 0 <= i + step < len(footage) and not (soft[i + step] > 127).any():
+            whole = _gone_with(footage, i, i + step, soft[i] > 127, whole)
+            i += step
+            outline = _left_of(footage, outlines, i, whole, usual) if whole.any() else None
+            if outline is None:
+                break
+            soft[i], found[i], ways[i] = np.rint(255 * outline), outline, step
+            confidence[i] = confidence[i - step]
+            if WHOLE < (outline > 0.5).sum() / whole.sum() < 1 / WHOLE:
+                whole = outline > 0.5
+        progress((done + 1) / (2 * len(shown)))
+    return Track(soft, confidence), found, ways
+
+
+def _gone_with(
+    footage: Footage,
+    i: int,
+    j: int,
+    seen: Bool[np.ndarray, "h w"],
+    whole: Bool[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    """The mask of a whole object of frame `i` in frame `j`: moved with its pixels if all of it is
+    seen in both, else shifted as what is seen of it moves."""
+    moved, *_ = moved_on(footage, i, j, seen)
+    if not moved.any() or moved.sum() > WHOLE * whole.sum():
+        return moved
+    x, y = np.array(center_of(moved)) - center_of(seen)
+    return ndimage.shift(whole.astype(np.uint8), (round(float(y)), round(float(x))), order=0) > 0
+
+
+def _left_of(
+    footage: Footage,
+    outlines: Outlines,
+    i: int,
+    whole: Bool[np.ndarray, "h w"],
+    usual: Float[np.ndarray, " B"],
+) -> Float[np.ndarray, "h w"] | None:
+    """Of what the network may see in the box about an object, the soft mask that is most of it and
+    nothing else; None where there is none.
+
+    Args:
+        usual: roots of the histogram of the object's colours.
+    """
+    best, most = None, 0.0
+    for outline in _in_box(footage, outlines, i, whole):
+        mask = outline.mask & ~footage.blank[i]
+        share, within = overlap(mask, whole), (mask & whole).sum() / max(mask.sum(), 1)
+        if outline.quality < SURER or share < LEFT or within < WITHIN:
+            continue
+        alike = np.sqrt(_colors(footage, i, mask)) @ usual
+        if outline.quality + share > most and alike > LIKE:
+            best, most = np.where(mask, outline.soft, np.float32(0)), outline.quality + share
+    return best
+
+
+def _in_box(
+    footage: Footage, outlines: Outlines, i: int, mask: Bool[np.ndarray, "h w"]
+) -> list[Outline]:
+    x0, y0, x1, y1 = box_of(mask)
+    room = ROOM * max(x1 - x0, y1 - y0)
+    outlines.look(footage.numbers[i], around((x0, y0, x1, y1), footage.shape))
+    return outlines.found([(x0 - room, y0 - room), (x1 + room, y1 + room)], [LOW, HIGH])
+
+
+def _colors(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " B"]:
+    return histogram(bins_of(footage.colors(i)), mask * 1.0)
+
+
+def _led(
+    found: Outlined, clicked: Collection[int], ways: Mapping[int, int], count: int
+) -> Bool[np.ndarray, " F"]:
     led = np.zeros(count, bool)
-    for start in clicked:
-        for step in (1, -1):
-            i = start
-            while i in found:
-                led[i] = True
-                there = found.get(i + step)
-                if there is None or not _steady(found[i] > 0.5, there > 0.5):
-                    break
-                i += step
+    for start, step in product(clicked, (1, -1)):
+        i = start
+        while i in found:
+            led[i] = True
+            there = found.get(i + step)
+            if there is None:
+                break
+            carried = ways.get(i + step) == step or ways.get(i) == -step
+            if not carried and not _steady(found[i] > 0.5, there > 0.5):
+                break
+            i += step
     return led
 
 
@@ -137,10 +259,7 @@ def again(
 ) -> Float[np.ndarray, "h w"] | None:
     """A soft mask by the network's outline in the box about a mask; None where it is of something
     else, or not sure."""
-    x0, y0, x1, y1 = box_of(mask)
-    room = ROOM * max(x1 - x0, y1 - y0)
-    outlines.look(footage.numbers[i], around((x0, y0, x1, y1), footage.shape))
-    found = outlines.found([(x0 - room, y0 - room), (x1 + room, y1 + room)], [LOW, HIGH])[0]
+    found = _in_box(footage, outlines, i, mask)[0]
     kept = _kept(found, mask) & ~footage.blank[i]
     if found.quality < SURE or overlap(kept, mask) < SAME:
         return None
