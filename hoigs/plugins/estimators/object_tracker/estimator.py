@@ -61,6 +61,7 @@ from hoigs.plugins.estimators.object_tracker.states import (
     looks_like_skin,
     mostly_doubtful,
     states_of,
+    takes_in_hands,
 )
 from hoigs.plugins.estimators.object_tracker.together import (
     followed_together,
@@ -149,6 +150,10 @@ SHIRT = (
 SKIN = (
     "what was taken has the colours of people's faces and hands: that is rather a bare arm or leg, "
     "and is dropped; click on the object"
+)
+HANDS = (
+    "its masks take in the hands that hold it, so that none counts as seen: click on it in a frame "
+    "that shows it beside them, or give a box"
 )
 EQUAL = (
     "other things look the same, so that only its path tells which is which; where it does not, "
@@ -331,8 +336,13 @@ class ObjectTrackerEstimator(Estimator):
         own = [n for n, m in prompts.items() if m and n not in chosen]
         faint = [n for n in own if all(_looks_like_scenery(scene, p) for p in prompts[n])]
         scenery = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
-        states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in (*worn, *scenery)}
-        why = ((vague, VAGUE), (shirts, SHIRT), (bare, SKIN), (worn, CLOTHES))
+        bodies = {n: t for n, t in tracks.items() if t is not None and n not in rods}
+        handed = [n for n, t in bodies.items() if takes_in_hands(footage, t.soft > 127, people)]
+        unsure = (*worn, *scenery, *handed)
+        states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in unsure}
+        why = (
+            (vague, VAGUE), (shirts, SHIRT), (bare, SKIN), (worn, CLOTHES), (handed, HANDS),
+        )  # fmt: skip
         said = [f"{n}: {reason}" for names, reason in why for n in names]
         notes += [*alike, *said, *doubts(tracks, footage)]
         return tracks, Said(chosen, notes, states, outlines is not None)

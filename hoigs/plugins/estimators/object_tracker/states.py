@@ -34,6 +34,8 @@ CLOTHED, COVERS = 0.85, 0.35  # share of a shirt that torso and sleeves hold, an
 BARE = (0, 9, 10, 15, 16, 19, 20)  # landmarks of face and hands
 AROUND = 0.07  # torsos about these that are skin
 LIKE_SKIN = 0.72  # likeness of colours from which a thing is rather skin
+HANDS, OF_HAND = range(15, 23), 0.16  # landmarks of hands, and torsos about these that are hands
+HANDED = 0.17  # share of a mask that is hands, from which it takes them in
 RIM = 2  # pixels from the edge of the picture within which a mask reaches it
 RECENT = 8  # frames before it was seen last that say how it moved
 BEYOND = 0.5  # of what was seen of it last: what has less left in the picture is out of it
@@ -159,6 +161,32 @@ def looks_like_skin(
     usual = np.sqrt(np.mean(skin, 0))
     own = [histogram(bins_of(footage.colors(i)), masks[i] * 1.0) for i in shown]
     return float(np.median(np.sqrt(own) @ usual)) > LIKE_SKIN
+
+
+def takes_in_hands(
+    footage: Footage,
+    masks: Bool[np.ndarray, "F h w"],
+    people: Sequence[Float[np.ndarray, "F 33 4"]],
+) -> bool:
+    """Whether the hands that hold an object are in its masks, in most frames: much of these is near
+    landmarks of hands and has colours as common along limbs. False where neither is known.
+
+    Args:
+        masks: of the object. people: landmarks of each person, pixels and visibility.
+    """
+    reach = OF_HAND * usual_torso(people)
+    if footage.limbs is None or not np.isfinite(reach):
+        return False
+    shares = []
+    for i in np.flatnonzero(masks.any((1, 2))).tolist():
+        y, x = np.nonzero(masks[i])
+        seen = [p[i, k, :2] for p in people for k in HANDS if p[i, k, 3] > VISIBLE]
+        near = [np.hypot(x + 0.5 - at[0], y + 0.5 - at[1]) < reach for at in seen]
+        bins = bins_of(footage.colors(i))[masks[i]]
+        own = histogram(bins, np.ones(len(bins)))[bins]
+        alike = np.minimum(1, footage.limbs[bins] / np.maximum(own, 1e-6))
+        shares.append(float((alike * np.any(near, axis=0)).mean()) if near else 0.0)
+    return bool(shares) and float(np.median(shares)) > HANDED
 
 
 def _left(masks: Bool[np.ndarray, "F h w"], seen: Int[np.ndarray, " S"], i: int) -> bool:

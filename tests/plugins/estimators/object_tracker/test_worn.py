@@ -1,16 +1,21 @@
-"""What is proposed and covers a torso is clothes, and what has the colours of skin a limb."""
+"""What is proposed and covers a torso is clothes, and what has the colours of skin a limb; and
+masks that take in the hands that hold a thing are told."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from disc_world import texture
 from test_behind import footage_of
 
+from hoigs.plugins.estimators.object_tracker.footage import bins_of, histogram
 from hoigs.plugins.estimators.object_tracker.states import (
     covers_torso,
     is_worn,
     looks_like_skin,
+    takes_in_hands,
 )
 
 FRAMES, SIDE = 8, 120
@@ -69,3 +74,20 @@ def test_a_bare_leg_is_told_from_a_thing_by_face_and_hands(
     assert looks_like_skin(seen, leg, [marks]) == skin
     marks[..., 3] = 0  # nobody's face or hands are seen
     assert not looks_like_skin(seen, leg, [marks])
+
+
+@pytest.mark.parametrize("with_hand", [True, False])
+def test_masks_with_the_hand_that_holds_the_object_are_told(with_hand: bool) -> None:
+    skin, green, marks = (205, 150, 125), (60, 140, 80), someone()
+    frame = texture(0, (90, 110, 150), (SIDE, SIDE))
+    for k, at in {16: (96, 60), 18: (100, 64), 20: (104, 62), 22: (102, 58)}.items():
+        marks[:, k] = (*at, 0, 1)
+    arm, thing = box(84, 50, 108, 70)[0], box(104, 52, 118, 68)[0]
+    for region, color in ((arm, skin), (thing, green)):
+        frame[region] = texture(2, color, (SIDE, SIDE))[region]
+    seen = footage_of([frame.astype(np.uint8)] * FRAMES, [np.ones((SIDE, SIDE), bool)] * FRAMES)
+    skin_bins = bins_of(seen.colors(0))[arm & ~thing]
+    footage = replace(seen, limbs=histogram(skin_bins, np.ones(len(skin_bins))))
+    mask = (thing | arm) if with_hand else thing
+    assert takes_in_hands(footage, np.stack([mask] * FRAMES), [marks]) == with_hand
+    assert not takes_in_hands(seen, np.stack([mask] * FRAMES), [marks])  # limbs are not known
