@@ -91,6 +91,7 @@ def _sharpened(footage: Footage, track: Track, found: Outlined) -> Track:
 
 
 STEADY = 0.7  # overlap of a thing's outlines in one frame and the next, about their middles
+ODD = 0.05  # by how much more the masks beside one overlap each other than it, which is odd then
 
 
 def _steadied(footage: Footage, outlines: Outlines, track: Track) -> tuple[Track, Outlined]:
@@ -102,10 +103,11 @@ def _steadied(footage: Footage, outlines: Outlines, track: Track) -> tuple[Track
     shown, last = masks.any((1, 2)), len(masks) - 1
     for i in np.flatnonzero(shown).tolist() if last > 1 else ():
         a, b = (i - 1, i + 1) if 0 < i < last else (1, 2) if i == 0 else (last - 1, last - 2)
-        if not _steady(masks[a], masks[b]) or _steady(masks[i], masks[a]):
+        alike = _alike(masks[i], masks[a])
+        if _alike(masks[a], masks[b]) < max(STEADY, alike + ODD):
             continue
         outline = again(footage, outlines, i, masks[a])
-        if outline is not None and _steady(outline > 0.5, masks[a]):
+        if outline is not None and _alike(outline > 0.5, masks[a]) > max(STEADY, alike):
             soft[i], found[i] = np.rint(255 * outline), outline
     return Track(soft, track.confidence), found
 
@@ -247,11 +249,16 @@ def _led(
 
 def _steady(mask: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> bool:
     """Whether two masks are of one shape, wherever they are."""
+    return _alike(mask, other) >= STEADY
+
+
+def _alike(mask: Bool[np.ndarray, "h w"], other: Bool[np.ndarray, "h w"]) -> float:
+    """Overlap of two masks about their middles; 0 where one is empty."""
     if not (mask.any() and other.any()):
-        return False
+        return 0.0
     away = np.array(center_of(mask)) - center_of(other)
     dx, dy = np.rint(away).astype(int).tolist()
-    return overlap(mask, np.roll(other, (dy, dx), (0, 1))) >= STEADY
+    return overlap(mask, np.roll(other, (dy, dx), (0, 1)))
 
 
 def again(

@@ -161,8 +161,11 @@ def test_a_mask_that_differs_from_those_beside_it_is_outlined_as_they_are(fake, 
     slow = scene[2]
     soft = np.stack(slow).astype(np.uint8) * 255
     soft[0, :60, :40] = 255  # the clicked mask takes in much of the wall
+    soft[7, 4:9, 4:9] = 255  # and another one a spot far away
     better = better_than(scene, request(tmp_path, scene), soft, (0,))
-    assert overlap(better.track.soft[0] > 127, slow[0]) > 0.85
+    for i in (0, 7):
+        assert overlap(better.track.soft[i] > 127, slow[i]) > 0.85
+    assert not (better.track.soft[7, :20] > 127).any()
     assert better.led.all()
 
 
