@@ -89,10 +89,12 @@ def clicked_mask(
         return grown
     points = [*map(tuple, inside), *map(tuple, outside)]
     labels = [INSIDE] * len(inside) + [OUTSIDE] * len(outside)
-    joints = _joints(footage, i, inside) if grown.on_person else []
-    seen = _looked(outlines, number, points, labels, joints) if box is None else []
-    if box is None and (mask := grown.soft > 0.5).any():
-        box = box_of(mask)
+    seen = []
+    if box is None:
+        joints = _joints(footage, i, inside) if grown.on_person else []
+        seen = _looked(outlines, number, points, labels, joints)
+        if (mask := grown.soft > 0.5).any():
+            box = box_of(mask)
     if box is not None:
         x0, y0, x1, y1 = (float(v) for v in box)
         outlines.look(number, around((x0, y0, x1, y1), footage.shape))

@@ -183,9 +183,15 @@ def test_a_click_on_what_is_held_takes_no_hand_of_like_colours(fake, tmp_path) -
     video = request(tmp_path, (frames, people, discs))
     known = replace(video.known, landmarks={"human": Landmarks(marks)})
     footage = read_footage(replace(video, known=known), people)
+    x, y = click(3).points[0].x, click(3).points[0].y
+    box = FramePrompt(3, (), (x - 9, y - 9, x + 9, y + 9))
     with Outlines(footage.shape, video.frame) as network:
-        found = clicked_mask(footage, static_scene(footage), 3, click(3), None, network)
-    assert overlap(found.soft > 0.5, discs[3]) > 0.8
+        clicked, boxed = (
+            clicked_mask(footage, static_scene(footage), 3, asked, None, network).soft > 0.5
+            for asked in (click(3), box)
+        )
+    assert overlap(clicked, discs[3]) > 0.8
+    assert (boxed & discs[3]).sum() > 0.8 * discs[3].sum()
 
 
 def test_what_outlines_lead_to_from_a_click_is_seen_whatever_colours_it_has(tmp_path) -> None:
