@@ -47,18 +47,17 @@ def refined(
 
     Args:
         clicked: frames in which it is known. rivals: whether other things look the same, so that
-            only frames between those that show it are filled.
+            no further frame is taken to show it.
     """
     found = _outlined(footage, outlines, track, lambda share: progress(0.7 * share))
     better = _sharpened(footage, track, found)
+    if rivals:
+        return Refined(better, _led(found, clicked, {}, len(footage)))
     better, other = _steadied(footage, outlines, better)
     better, more = _bridged(footage, outlines, better, lambda share: progress(0.7 + 0.1 * share))
-    beyond: Outlined = {}
-    ways: dict[int, int] = {}
-    if not rivals:
-        better, beyond, ways = _carried_on(
-            footage, outlines, better, lambda share: progress(0.8 + 0.2 * share)
-        )
+    better, beyond, ways = _carried_on(
+        footage, outlines, better, lambda share: progress(0.8 + 0.2 * share)
+    )
     return Refined(better, _led(found | other | more | beyond, clicked, ways, len(footage)))
 
 
