@@ -336,8 +336,12 @@ class ObjectTrackerEstimator(Estimator):
         own = [n for n, m in prompts.items() if m and n not in chosen]
         faint = [n for n in own if all(_looks_like_scenery(scene, p) for p in prompts[n])]
         scenery = [n for n in faint if (t := tracks[n]) and never_leaves(scene, t.soft > 127)]
-        bodies = {n: t for n, t in tracks.items() if t is not None and n not in rods}
-        handed = [n for n, t in bodies.items() if takes_in_hands(footage, t.soft > 127, people)]
+        # these are not dropped: the masks are about the object, and of more than it
+        handed = [
+            n
+            for n, t in tracks.items()
+            if t and n not in rods and takes_in_hands(footage, t.soft > 127, people)
+        ]
         unsure = (*worn, *scenery, *handed)
         states |= {n: [DOUBTFUL if s == SEEN else s for s in states[n]] for n in unsure}
         why = (

@@ -273,9 +273,18 @@ def of_limbs(
     if footage.limbs is None:
         on = float(footage.person[i][mask].mean())
         return 0.5 * on * of_person(footage, i, mask) if on else 0.0
-    found = bins[mask]
-    own = histogram(found, np.ones(len(found)))
-    return float(np.minimum(1, footage.limbs[found] / (own[found] + 1e-6)).mean())
+    return float(like_limbs(footage.limbs, bins[mask]).mean())
+
+
+def like_limbs(limbs: Float[np.ndarray, " B"], bins: Int[np.ndarray, " N"]) -> np.ndarray:
+    """How common the colour of each pixel of a mask is along limbs, [N], against how common it is
+    in the mask, 0 to 1.
+
+    Args:
+        limbs: histogram of colours along limbs. bins: of the mask's pixels.
+    """
+    own = histogram(bins, np.ones(len(bins)))
+    return np.minimum(1, limbs[bins] / (own[bins] + 1e-6))
 
 
 def looks_like_person(footage: Footage, found: PromptedMask) -> bool:

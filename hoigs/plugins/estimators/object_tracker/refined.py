@@ -40,18 +40,18 @@ def refined(
     outlines: Outlines,
     track: Track,
     clicked: Collection[int],
-    rivals: bool = False,
+    has_rivals: bool = False,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Refined:
     """The same object with masks that the network outlines, in more frames.
 
     Args:
-        clicked: frames in which it is known. rivals: whether other things look the same, so that
-            no further frame is taken to show it.
+        clicked: frames in which it is known. has_rivals: other things look the same, so that no
+            further frame is taken to show it.
     """
     found = _outlined(footage, outlines, track, lambda share: progress(0.7 * share))
     better = _sharpened(footage, track, found)
-    if rivals:
+    if has_rivals:
         return Refined(better, _led(found, clicked, {}, len(footage)))
     better, other = _steadied(footage, outlines, better)
     better, more = _bridged(footage, outlines, better, lambda share: progress(0.7 + 0.1 * share))
@@ -218,6 +218,8 @@ def _left_of(
 def _in_box(
     footage: Footage, outlines: Outlines, i: int, mask: Bool[np.ndarray, "h w"]
 ) -> list[Outline]:
+    """What the network may see in the box about a mask: its own choice, then a part, a whole and a
+    group."""
     x0, y0, x1, y1 = box_of(mask)
     room = ROOM * max(x1 - x0, y1 - y0)
     outlines.look(footage.numbers[i], around((x0, y0, x1, y1), footage.shape))
@@ -225,12 +227,18 @@ def _in_box(
 
 
 def _colors(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, " B"]:
+    """Histogram of a mask's colours."""
     return histogram(bins_of(footage.colors(i)), mask * 1.0)
 
 
 def _led(
     found: Outlined, clicked: Collection[int], ways: Mapping[int, int], count: int
 ) -> Bool[np.ndarray, " F"]:
+    """Frames to which outlines lead from a clicked one, each like the one before, or carried there.
+
+    Args:
+        ways: of the carried ones, as `_carried_on` returns them.
+    """
     led = np.zeros(count, bool)
     for start, step in product(clicked, (1, -1)):
         i = start

@@ -24,7 +24,11 @@ from hoigs.plugins.estimators.object_tracker.footage import (
     SEEN as VISIBLE,
 )
 from hoigs.plugins.estimators.object_tracker.path import center_of
-from hoigs.plugins.estimators.object_tracker.prompts import OF_PERSON, lies_on_people
+from hoigs.plugins.estimators.object_tracker.prompts import (
+    OF_PERSON,
+    lies_on_people,
+    like_limbs,
+)
 from hoigs.plugins.estimators.object_tracker.propagation import Track
 
 SEEN, OUT, LOST, PERSON = "seen", "out of the picture", "lost", "hidden by a person"
@@ -169,7 +173,8 @@ def takes_in_hands(
     people: Sequence[Float[np.ndarray, "F 33 4"]],
 ) -> bool:
     """Whether the hands that hold an object are in its masks, in most frames: much of these is near
-    landmarks of hands and has colours as common along limbs. False where neither is known.
+    landmarks of hands and has colours as common along limbs. False where people's size, or the
+    colours of their limbs, are not known.
 
     Args:
         masks: of the object. people: landmarks of each person, pixels and visibility.
@@ -182,9 +187,7 @@ def takes_in_hands(
         y, x = np.nonzero(masks[i])
         seen = [p[i, k, :2] for p in people for k in HANDS if p[i, k, 3] > VISIBLE]
         near = [np.hypot(x + 0.5 - at[0], y + 0.5 - at[1]) < reach for at in seen]
-        bins = bins_of(footage.colors(i))[masks[i]]
-        own = histogram(bins, np.ones(len(bins)))[bins]
-        alike = np.minimum(1, footage.limbs[bins] / np.maximum(own, 1e-6))
+        alike = like_limbs(footage.limbs, bins_of(footage.colors(i))[masks[i]])
         shares.append(float((alike * np.any(near, axis=0)).mean()) if near else 0.0)
     return bool(shares) and float(np.median(shares)) > HANDED
 

@@ -112,11 +112,11 @@ def slowly() -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
 
 
 def better_than(
-    scene, video, soft: np.ndarray, clicked: tuple[int, ...], rivals: bool = False
+    scene, video, soft: np.ndarray, clicked: tuple[int, ...], has_rivals: bool = False
 ) -> Refined:
     footage, track = read_footage(video, scene[1]), Track(soft, 0.8 * soft.any((1, 2)))
     with Outlines(footage.shape, video.frame) as network:
-        return refined(footage, network, track, clicked, rivals)
+        return refined(footage, network, track, clicked, has_rivals)
 
 
 def test_outlines_lead_on_from_masks_as_far_as_the_object_is_there(fake, tmp_path) -> None:
