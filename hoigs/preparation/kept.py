@@ -62,7 +62,7 @@ PLAN = {
         version=6,
     ),
     "object_masks": Stage(
-        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=16
+        30, ("estimates",), ("object_name", "further_objects"), slow=True, version=17
     ),
     "cameras": Stage(
         3,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from itertools import pairwise, product
 
@@ -52,13 +52,11 @@ def refined(
     found = _outlined(footage, outlines, track, lambda share: progress(0.7 * share))
     better = _sharpened(footage, track, found)
     if has_rivals:
-        return Refined(better, _led(found, clicked, {}, len(footage)))
+        return Refined(better, _led(found, clicked, len(footage)))
     better, other = _steadied(footage, outlines, better)
     better, more = _bridged(footage, outlines, better, lambda share: progress(0.7 + 0.1 * share))
-    better, beyond, ways = _carried_on(
-        footage, outlines, better, lambda share: progress(0.8 + 0.2 * share)
-    )
-    return Refined(better, _led(found | other | more | beyond, clicked, ways, len(footage)))
+    led = _led(found | other | more, clicked, len(footage))
+    return _carried_on(footage, outlines, better, led, lambda share: progress(0.8 + 0.2 * share))
 
 
 Outlined = dict[int, Float[np.ndarray, "h w"]]  # soft masks of the network by frame
@@ -142,23 +140,27 @@ def _bridged(
 # Of an outline in a frame without a mask: the network's own estimate, the share of it that is where
 # the object went, their overlap, and the likeness of its colours and those of the object.
 SURER, WITHIN, LEFT, LIKE = 0.85, 0.8, 0.35, 0.6
+# Overlap from which no hand need hide the rest, and share of the object that an outline and people
+# explain together.
+OPEN, EXPLAINED = 0.75, 0.8
 WHOLE = 0.88  # ratio of areas from which an outline shows all of the object
 
 
 def _carried_on(
-    footage: Footage, outlines: Outlines, track: Track, progress: Callable[[float], None]
-) -> tuple[Track, Outlined, dict[int, int]]:
-    """The same object in frames next to those that show it, too, as far as outlines are where its
-    motion carries it, such as the part of it that a hand leaves free; these outlines; and of each
-    the way that led to it, 1 from the frame before and -1 from the next."""
+    footage: Footage,
+    outlines: Outlines,
+    track: Track,
+    led: Bool[np.ndarray, " F"],
+    progress: Callable[[float], None],
+) -> Refined:
+    """The same object in frames next to those to which outlines lead from a click, too, as far as
+    outlines are where its motion carries it, such as the part of it that a hand leaves free."""
     soft, confidence = track.soft.copy(), track.confidence.copy()
-    shown = np.flatnonzero((track.soft > 127).any((1, 2))).tolist()
-    if not shown:
-        return track, {}, {}
-    usual = np.sqrt(np.mean([_colors(footage, i, soft[i] > 127) for i in shown], axis=0))
-    found: Outlined = {}
-    ways: dict[int, int] = {}
-    for done, (start, step) in enumerate(product(shown, (1, -1))):
+    certain, starts = led.copy(), np.flatnonzero(led).tolist()
+    if not starts:
+        return Refined(track, led)
+    usual = np.sqrt(np.mean([_colors(footage, i, soft[i] > 127) for i in starts], axis=0))
+    for done, (start, step) in enumerate(product(starts, (1, -1))):
         i, whole = start, soft[start] > 127
         while 0 <= i + step < len(footage) and not (soft[i + step] > 127).any():
             whole = _gone_with(footage, i, i + step, soft[i] > 127, whole)
@@ -166,12 +168,11 @@ def _carried_on(
             outline = _left_of(footage, outlines, i, whole, usual) if whole.any() else None
             if outline is None:
                 break
-            soft[i], found[i], ways[i] = np.rint(255 * outline), outline, step
-            confidence[i] = confidence[i - step]
+            soft[i], confidence[i], certain[i] = np.rint(255 * outline), confidence[i - step], True
             if WHOLE < (outline > 0.5).sum() / whole.sum() < 1 / WHOLE:
                 whole = outline > 0.5
-        progress((done + 1) / (2 * len(shown)))
-    return Track(soft, confidence), found, ways
+        progress((done + 1) / (2 * len(starts)))
+    return Refined(Track(soft, confidence), certain)
 
 
 def _gone_with(
@@ -198,16 +199,18 @@ def _left_of(
     usual: Float[np.ndarray, " B"],
 ) -> Float[np.ndarray, "h w"] | None:
     """Of what the network may see in the box about an object, the soft mask that is most of it and
-    nothing else; None where there is none.
+    nothing else; None where there is none, or no person hides the rest of the object.
 
     Args:
         usual: roots of the histogram of the object's colours.
     """
     best, most = None, 0.0
     for outline in _in_box(footage, outlines, i, whole):
-        mask = outline.mask & ~footage.blank[i]
+        mask = _kept(outline, whole) & ~footage.blank[i]
         share, within = overlap(mask, whole), (mask & whole).sum() / max(mask.sum(), 1)
         if outline.quality < SURER or share < LEFT or within < WITHIN:
+            continue
+        if share < OPEN and (whole & (mask | footage.person[i])).sum() < EXPLAINED * whole.sum():
             continue
         alike = np.sqrt(_colors(footage, i, mask)) @ usual
         if outline.quality + share > most and alike > LIKE:
@@ -231,24 +234,15 @@ def _colors(footage: Footage, i: int, mask: Bool[np.ndarray, "h w"]) -> Float[np
     return histogram(bins_of(footage.colors(i)), mask * 1.0)
 
 
-def _led(
-    found: Outlined, clicked: Collection[int], ways: Mapping[int, int], count: int
-) -> Bool[np.ndarray, " F"]:
-    """Frames to which outlines lead from a clicked one, each like the one before, or carried there.
-
-    Args:
-        ways: of the carried ones, as `_carried_on` returns them.
-    """
+def _led(found: Outlined, clicked: Collection[int], count: int) -> Bool[np.ndarray, " F"]:
+    """Frames to which outlines lead from a clicked one, each like the one before."""
     led = np.zeros(count, bool)
     for start, step in product(clicked, (1, -1)):
         i = start
         while i in found:
             led[i] = True
             there = found.get(i + step)
-            if there is None:
-                break
-            carried = ways.get(i + step) == step or ways.get(i) == -step
-            if not carried and not _steady(found[i] > 0.5, there > 0.5):
+            if there is None or not _steady(found[i] > 0.5, there > 0.5):
                 break
             i += step
     return led

@@ -98,7 +98,7 @@ def test_followed_masks_are_outlined_again_where_the_network_sees_the_same(fake,
     for i in (1, 2, 3):
         assert overlap(found[i], scene[2][i]) > max(0.85, overlap(rough[i], scene[2][i]))
     assert np.array_equal(found[4], soft[4] > 127)
-    assert overlap(found[0], scene[2][0]) > 0.85  # to which they lead
+    assert not found[0].any()
 
 
 def slowly() -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
@@ -127,27 +127,33 @@ def test_outlines_lead_on_from_masks_as_far_as_the_object_is_there(fake, tmp_pat
         soft[i][slow[i]] = 255
     better = better_than(scene, request(tmp_path, scene), soft, (6,))
     found = better.track.soft > 127
-    for i in (*range(9), 10, 11, 12, 13):
+    for i in range(9):
         assert overlap(found[i], slow[i]) > 0.85, i
-    assert not found[9].any() and better.track.confidence[13] == 0.8
+    assert not found[[9, 10, 12, 13]].any() and found[11].any()  # nothing leads to 11 from a click
+    assert better.track.confidence[0] == 0.8
     assert np.array_equal(np.flatnonzero(better.led), np.arange(9))  # of the click in 6
     among_equals = better_than(scene, request(tmp_path, scene), soft, (6,), True).track.soft > 127
     assert np.array_equal(np.flatnonzero(among_equals.any((1, 2))), (1, 6, 11))
 
 
+@pytest.mark.parametrize("hand", [True, False])
 def test_what_a_hand_leaves_free_of_an_object_is_still_it_and_comes_back_whole(
-    fake, tmp_path
+    fake, tmp_path, hand: bool
 ) -> None:
-    frames, _, slow = scene = slowly()
+    frames, people, slow = scene = slowly()
     x = np.arange(W)[None]
-    held = [*range(4, 9)]
-    for i in held:
+    for i in range(4, 9):
         left = np.flatnonzero(slow[i].any(0))[0]
-        frames[i][slow[i] & (x < left + 6)] = (205, 150, 125)  # fingers, before a part of it
+        fingers = slow[i] & (x < left + 6)
+        frames[i][fingers] = (205, 150, 125)
+        people[i] = people[i] | (fingers & hand)
     soft = np.zeros((len(frames), H, W), np.uint8)
     for i in range(4):
         soft[i][slow[i]] = 255
     better = better_than(scene, request(tmp_path, scene), soft, (0,))
+    if not hand:  # nobody is known to hide the rest
+        assert not better.track.soft[4:].any() and not better.led[4:].any()
+        return
     found = better.track.soft > 127
     for i in range(len(frames)):
         free = slow[i] & (frames[i] == (230, 60, 50)).all(-1)
